@@ -1,0 +1,736 @@
+"""Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
+
+    python sac_minitaur.py                                    # about MINUTES minutes on two CPU cores, return RETURN
+    python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
+    python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
+    python sac_minitaur.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy
+    torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
+
+It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
+Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every value of theirs is a default here but those
+marked "ours" in `Config`, each for a reason that README's ablation table measures.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from torch import nn
+from torch.nn import functional as F
+
+import common
+from common import InputError
+
+
+@dataclass(frozen=True)
+class Config:
+    """Soft Actor-Critic on the Minitaur. Values are the tutorials' unless a line says "ours"."""
+
+    env_id: str = "MinitaurBulletEnv-v0"
+    """a gymnasium task with a bounded Box action space"""
+    num_iterations: int = 100_000
+    """gradient updates"""
+    initial_collect_steps: int = 10_000
+    """environment steps with random actions before the first update, over all processes"""
+    collect_steps_per_iteration: int = 1
+    """environment steps per gradient update, over all environments and processes"""
+    num_envs: int = 1
+    """environments that each process steps at once, each in a worker process of its own"""
+    replay_buffer_capacity: int = 1_000_000
+    """transitions kept by each process (the 2018 tutorial's value; the later ones have 10 000)"""
+    batch_size: int = 256
+    """transitions per update, over all processes"""
+
+    actor_learning_rate: float = 3e-4
+    """Adam's, for the actor"""
+    critic_learning_rate: float = 3e-4
+    """Adam's, for the critics"""
+    alpha_learning_rate: float = 3e-4
+    """Adam's, for log α"""
+    adam_epsilon: float = 1e-7
+    """Adam's ε (Keras' default, which the tutorials leave unsaid)"""
+    target_update_tau: float = 0.005
+    """step of the target critics towards the critics, after every update"""
+    gamma: float = 0.99
+    """discount"""
+    reward_scale_factor: float = 100.0
+    """ours (theirs: 1): rewards are about 0.01 a step, lost in the noise of a new critic"""
+    critic_loss_weight: float = 0.5
+    """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
+    target_entropy_per_action: float = -1.0
+    """ours, and the paper's −|A| (TF-Agents' default, which the tutorials leave unsaid: −|A|/2, so −0.5)"""
+    initial_log_alpha: float = -2.0
+    """ours (TF-Agents' default, which the tutorials leave unsaid: 0)"""
+    actor_layers: tuple[int, ...] = (256, 256)
+    """hidden units of the actor"""
+    critic_layers: tuple[int, ...] = (256, 256)
+    """hidden units of each critic"""
+    critic_layer_norm: bool = True
+    """ours (theirs: none): keeps the critics from diverging where the replay has no data (arXiv:2302.02948)"""
+    observation_scaling: bool = True
+    """ours (theirs: none): standardize observations by the mean and spread of the initial random data"""
+
+    seed: int = 0
+    """source of all randomness"""
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:N or mps"""
+    num_threads: int = 1
+    """CPU threads of the update; the physics and the evaluations want the other cores"""
+    run_dir: str | None = None
+    """a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)"""
+    resume: str | None = None
+    """directory of a run to continue from its last checkpoint"""
+    evaluate: str | None = None
+    """an exported policy (.pt2) to evaluate and film instead of training"""
+    video: bool = True
+    """film the trained and the random agent at the end"""
+    log_interval: int = 5_000
+    """updates between rows of train.csv"""
+    eval_interval: int = 10_000
+    """updates between evaluations"""
+    num_eval_episodes: int = 20
+    """episodes per evaluation"""
+    checkpoint_interval: int = 5_000
+    """updates between checkpoints, the policy's export among them"""
+
+
+# Fields that a resumed run may change: they decide what is written and where, not what is learned.
+HARMLESS_FIELDS = ("run_dir", "evaluate", "video", "checkpoint_interval")
+
+
+# The environment
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What the Minitaur draws anew at every reset. Ranges: pybullet's minitaur_env_randomizer.py."""
+
+    base_mass: float
+    """kg, the model's × U(0.8, 1.2)"""
+    leg_mass: float
+    """kg, of each of the 16 leg links, the model's × U(0.8, 1.2)"""
+    motor_mass: float
+    """kg, of each of the 8 motors, the model's × U(0.8, 1.2)"""
+    voltage: float
+    """V, the battery's, U(14.8, 16.8)"""
+    viscous_damping: float
+    """N·m·s/rad, the motors', U(0, 0.01)"""
+    foot_friction: float
+    """lateral friction coefficient of the feet, U(0.8, 1.5)"""
+
+
+class MinitaurBulletEnv(gym.Env):
+    """Ghost Robotics' Minitaur on a plane, equal to the last bit to pybullet's `MinitaurBulletEnv-v0` of the old gym.
+
+    Action (8,): for each leg (front left, back left, front right, back right) first its swing, then for each leg its
+    extension, in [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
+    Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
+    orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
+    Reward: metres forward in this step less 0.005 × 0.002 s × the mechanical power in W.
+    Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
+
+    SUBSTEPS, SUBSTEP_SECONDS, SOLVER_ITERATIONS = 5, 0.002, 60
+    MOTORS = tuple(f"{leg}{side}" for leg in ("front_left", "back_left", "front_right", "back_right") for side in "LR")
+    DIRECTION = np.array([-1.0, -1, -1, -1, 1, 1, 1, 1])
+    BASE_LINK = -1
+    LEG_LINKS = (2, 3, 5, 6, 8, 9, 11, 12, 15, 16, 18, 19, 21, 22, 24, 25)
+    MOTOR_LINKS = (1, 4, 7, 10, 14, 17, 20, 23)
+    FOOT_LINKS = (3, 6, 9, 12, 16, 19, 22, 25)
+    KNEE_ANGLE = -2.1834
+    KP, KD = 1.0, 0.02
+    RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0
+    MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7
+    # Motor torque in N·m at currents of 0, 10, … 60 A: the iron saturates.
+    CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])
+    TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])
+    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500
+    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13
+
+    def __init__(self, render_mode=None):
+        # Imported here so that other tasks train on machines without pybullet.
+        import pybullet
+        import pybullet_data
+        from pybullet_utils.bullet_client import BulletClient
+
+        self.render_mode = render_mode
+        self.simulator = BulletClient(pybullet.DIRECT)
+        self.simulator.setAdditionalSearchPath(pybullet_data.getDataPath())
+        max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT
+        high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01
+        self.observation_space = gym.spaces.Box(np.float32(-high), np.float32(high))
+        self.action_space = gym.spaces.Box(-1, 1, (8,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._build()
+        self.dynamics = (options or {}).get("dynamics") or self._draw_dynamics()
+        self._apply_dynamics()
+        self.hot_substeps = np.zeros(8)
+        self.motor_enabled = np.ones(8, bool)
+        self.x = 0.0
+        self._read_motors()
+        for _ in range(100):
+            self._substep(math.pi / 2)
+        return self._observation(), {}
+
+    def _build(self):
+        """Loads plane and robot into an empty simulation, in the start pose, its legs closed to four-bar linkages."""
+        simulator = self.simulator
+        simulator.resetSimulation()
+        simulator.setPhysicsEngineParameter(numSolverIterations=self.SOLVER_ITERATIONS)
+        simulator.setTimeStep(self.SUBSTEP_SECONDS)
+        simulator.loadURDF("plane.urdf")
+        simulator.setGravity(0, 0, -10)
+        self.robot = robot = simulator.loadURDF(
+            "quadruped/minitaur.urdf", (0, 0, 0.2), flags=simulator.URDF_USE_SELF_COLLISION
+        )
+        joints = (simulator.getJointInfo(robot, i) for i in range(simulator.getNumJoints(robot)))
+        joint = {info[1].decode(): info[0] for info in joints}
+        self.motor_joints = [joint[f"motor_{motor}_joint"] for motor in self.MOTORS]
+        knee_joints = [joint[f"knee_{motor}_link"] for motor in self.MOTORS]
+        for motor, knee, direction in zip(self.motor_joints, knee_joints, self.DIRECTION):
+            simulator.resetJointState(robot, motor, direction * math.pi / 2)
+            simulator.resetJointState(robot, knee, direction * self.KNEE_ANGLE)
+            for free in (motor, knee):  # pybullet's own velocity motor brakes every joint until it is given no force
+                simulator.setJointMotorControl2(robot, free, simulator.VELOCITY_CONTROL, force=0)
+        for left, right in zip(knee_joints[::2], knee_joints[1::2]):
+            simulator.createConstraint(
+                robot, right, robot, left, simulator.JOINT_POINT2POINT, (0, 0, 0), (0, 0.005, 0.2), (0, 0.01, 0.2)
+            )
+
+    def _draw_dynamics(self):
+        uniform = self.np_random.uniform
+        links = (self.BASE_LINK, self.LEG_LINKS[0], self.MOTOR_LINKS[0])
+        masses = (self.simulator.getDynamicsInfo(self.robot, link)[0] for link in links)
+        return Dynamics(*(m * uniform(0.8, 1.2) for m in masses), uniform(14.8, 16.8), uniform(0, 0.01), uniform(0.8, 1.5))
+
+    def _apply_dynamics(self):
+        change, dynamics = self.simulator.changeDynamics, self.dynamics
+        change(self.robot, self.BASE_LINK, mass=dynamics.base_mass)
+        for link in self.LEG_LINKS:
+            change(self.robot, link, mass=dynamics.leg_mass)
+        for link in self.MOTOR_LINKS:
+            change(self.robot, link, mass=dynamics.motor_mass)
+        for link in self.FOOT_LINKS:
+            change(self.robot, link, lateralFriction=dynamics.foot_friction)
+
+    def step(self, action):
+        """Raises ValueError when an action component is outside ±1.01, as the original does."""
+        action = np.asarray(action)
+        if not (np.abs(action) <= 1.01).all():
+            raise ValueError(f"action {action} is outside [-1, 1]")
+        command = self._motor_angles(action)
+        for _ in range(self.SUBSTEPS):
+            self._substep(command)
+        observation = self._observation()
+        x, _, height = self.position
+        energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS
+        reward = x - self.x - 0.005 * energy
+        self.x = x
+        up_z = self.simulator.getMatrixFromQuaternion(self.orientation)[8]
+        fallen = up_z < self.MIN_UPRIGHTNESS or height < self.MIN_HEIGHT
+        return observation, float(reward), fallen, False, {}
+
+    @staticmethod
+    def _motor_angles(action):
+        """The angles in rad that the eight motors are to reach, from the leg model's swing and extension.
+
+        In the action's own precision and in this order: with float32 actions the original computes in float32 too.
+        """
+        swing, extension = np.repeat(action[:4], 2), np.repeat(action[4:], 2)
+        quarter = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)
+        return math.pi + -math.pi / 4 * (extension + 1.5) + quarter * swing
+
+    def _substep(self, command):
+        """Drives the motors towards the angles `command` for 0.002 s (pybullet's motor.py, in its order of operations)."""
+        simulator, dynamics = self.simulator, self.dynamics
+        pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
+        drive = pwm * dynamics.voltage
+        self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(
+            -self.MAX_OBSERVED_TORQUE, self.MAX_OBSERVED_TORQUE
+        )
+        back_emf = (self.TORQUE_CONSTANT + dynamics.viscous_damping) * self.velocity
+        current = (drive - back_emf).clip(-self.MAX_NET_VOLTAGE, self.MAX_NET_VOLTAGE) / self.RESISTANCE
+        torque = np.interp(np.abs(current), self.CURRENTS, self.TORQUES)
+        self.hot_substeps = (self.hot_substeps + 1) * (torque > self.OVERHEAT_TORQUE)
+        self.motor_enabled &= self.hot_substeps <= self.OVERHEAT_SUBSTEPS
+        force = np.sign(current) * torque * self.DIRECTION * self.motor_enabled
+        simulator.setJointMotorControlArray(
+            self.robot, self.motor_joints, simulator.TORQUE_CONTROL, forces=force.tolist()
+        )
+        simulator.stepSimulation()
+        self._read_motors()
+
+    def _read_motors(self):
+        states = self.simulator.getJointStates(self.robot, self.motor_joints)
+        self.angle = np.array([state[0] for state in states]) * self.DIRECTION
+        self.velocity = np.array([state[1] for state in states]) * self.DIRECTION
+
+    def _observation(self):
+        self.position, self.orientation = self.simulator.getBasePositionAndOrientation(self.robot)
+        return np.concatenate(
+            (self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32, casting="same_kind"
+        )
+
+    def render(self):
+        """The robot from the side that it runs past, (360, 480, 3) uint8, from pybullet's software renderer."""
+        simulator = self.simulator
+        position, _ = simulator.getBasePositionAndOrientation(self.robot)
+        view = simulator.computeViewMatrixFromYawPitchRoll(position, distance=1, yaw=0, pitch=-30, roll=0, upAxisIndex=2)
+        projection = simulator.computeProjectionMatrixFOV(fov=60, aspect=480 / 360, nearVal=0.1, farVal=100)
+        pixels = simulator.getCameraImage(480, 360, view, projection, renderer=simulator.ER_TINY_RENDERER)[2]
+        return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
+
+    def close(self):
+        if self.simulator.isConnected():
+            self.simulator.disconnect()
+
+
+if "MinitaurBulletEnv-v0" not in gym.registry:
+    gym.register(
+        id="MinitaurBulletEnv-v0", entry_point=MinitaurBulletEnv, max_episode_steps=1000, reward_threshold=15.0
+    )
+
+
+def make_env(env_id, **kwargs):
+    """The task as registered. Raises InputError when it is unknown or its spaces are not bounded actions in a Box."""
+    try:
+        env = gym.make(env_id, **kwargs)
+    except (gym.error.Error, ImportError) as error:
+        raise InputError(f"--env-id {env_id} cannot be made: {common.first_line(error)}") from None
+    if not isinstance(env.action_space, gym.spaces.Box) or not env.action_space.is_bounded():
+        raise InputError(f"--env-id {env_id} has the action space {env.action_space}: SAC needs a bounded Box")
+    if not isinstance(env.observation_space, gym.spaces.Box):
+        raise InputError(f"--env-id {env_id} has the observation space {env.observation_space}: a Box is needed")
+    return env
+
+
+def make_training_env(env_id):
+    """The task with flat observations and actions in [-1, 1], as the agent sees it."""
+    env = make_env(env_id)
+    if (env.action_space.low != -1).any() or (env.action_space.high != 1).any():
+        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    return env if len(env.observation_space.shape) == 1 else gym.wrappers.FlattenObservation(env)
+
+
+# The networks
+
+
+def mlp(inputs, hidden_layers, outputs, layer_norm=False):
+    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization)."""
+    layers = []
+    for units in hidden_layers:
+        layers += [nn.Linear(inputs, units), *([nn.LayerNorm(units)] if layer_norm else []), nn.ReLU()]
+        inputs = units
+    layers.append(nn.Linear(inputs, outputs))
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers)
+
+
+class ObservationScaling(nn.Module):
+    """Standardizes observations (…, O) by a fixed mean and spread, clipped to ±5; the identity until `fit`."""
+
+    def __init__(self, observation_size):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(observation_size))
+        self.register_buffer("std", torch.ones(observation_size))
+        self.register_buffer("limit", torch.tensor(torch.inf))
+
+    def fit(self, observations, ranks):
+        """Takes mean and spread from observations (N, O), over all ranks."""
+        mean = ranks.mean(observations.mean(0))
+        variance = ranks.mean((observations - mean).square().mean(0))
+        self.mean.copy_(mean)
+        # What hardly moves under random actions may move later: its spread is not taken for less than 0.01.
+        self.std.copy_(variance.sqrt().clamp(min=0.01))
+        self.limit.fill_(5.0)
+
+    def forward(self, observation):
+        return ((observation - self.mean) / self.std).clamp(-self.limit, self.limit)
+
+
+class Actor(nn.Module):
+    """A Gaussian over actions, squashed by tanh into (-1, 1)."""
+
+    def __init__(self, observation_size, action_size, hidden_layers):
+        super().__init__()
+        self.net = mlp(observation_size, hidden_layers, 2 * action_size)
+
+    def forward(self, observation):
+        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O)."""
+        mean, log_std = self.net(observation).chunk(2, dim=-1)
+        return mean, log_std.clamp(-20, 2)
+
+    def sample(self, observation):
+        """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
+
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The subtracted term
+        equals 2 (log 2 − u − softplus(−2u)) exactly, and does not round to log 0 where tanh saturates.
+        """
+        mean, log_std = self(observation)
+        noise = torch.randn_like(mean)
+        u = mean + log_std.exp() * noise
+        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
+        return u.tanh(), (log_normal - log_determinant).sum(-1)
+
+
+class TwinCritics(nn.Module):
+    """Two estimates of Q(s, a), independent of each other but for their data."""
+
+    def __init__(self, observation_size, action_size, hidden_layers, layer_norm):
+        super().__init__()
+        inputs = observation_size + action_size
+        self.q1 = mlp(inputs, hidden_layers, 1, layer_norm)
+        self.q2 = mlp(inputs, hidden_layers, 1, layer_norm)
+
+    def forward(self, observation, action):
+        """(2, …) for scaled observations (…, O) and actions (…, A)."""
+        x = torch.cat((observation, action), dim=-1)
+        return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
+
+
+class Policy(nn.Module):
+    """The deterministic policy, in the task's own units: what is evaluated, exported and filmed."""
+
+    def __init__(self, scaling, actor, action_space):
+        super().__init__()
+        self.scaling, self.actor = scaling, actor
+        low, high = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
+        self.register_buffer("center", (low + high) / 2)
+        self.register_buffer("half_range", (high - low) / 2)
+
+    def forward(self, observation):
+        """Actions (batch, *action shape) for raw observations (batch, *observation shape)."""
+        mean, _ = self.actor(self.scaling(observation.flatten(1)))
+        return self.center + self.half_range * mean.tanh().unflatten(1, self.center.shape)
+
+
+# The replay buffer
+
+
+class ReplayBuffer:
+    """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
+
+    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. Only
+    `terminated` is kept: an episode cut off by its time limit has not ended, and its last state has a value.
+    """
+
+    def __init__(self, capacity, observation_size, action_size, device):
+        self.sizes = (observation_size, action_size, 1, 1, observation_size)
+        self.rows = torch.empty(capacity, sum(self.sizes), device=device)
+        self.size = self.position = 0
+
+    def add(self, observations, actions, rewards, terminated, next_observations):
+        """Stores K transitions: (K, O), (K, …), (K,), (K,), (K, O), as numpy arrays. Overwrites the oldest when full."""
+        columns = (observations, actions.reshape(len(actions), -1), rewards[:, None], terminated[:, None], next_observations)
+        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
+        for row in rows:
+            self.rows[self.position].copy_(row)
+            self.position = (self.position + 1) % len(self.rows)
+            self.size = min(self.size + 1, len(self.rows))
+
+    def sample(self, batch_size):
+        """A batch drawn uniformly with replacement: (B, O), (B, A), (B,), (B,), (B, O)."""
+        indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
+        observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
+        return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
+
+    def observations(self):
+        """The observations stored so far: (size, O)."""
+        return self.rows[: self.size, : self.sizes[0]]
+
+    def state(self):
+        """A copy of the filled part, for a checkpoint."""
+        return {"rows": self.rows[: self.size].cpu().clone(), "position": self.position}
+
+    def load_state(self, state):
+        self.size, self.position = len(state["rows"]), state["position"]
+        self.rows[: self.size] = state["rows"].to(self.rows.device)
+
+
+# The agent
+
+
+def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
+    """r + γ (1 − terminated) (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
+
+    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum.
+    """
+    next_value = next_q.amin(0) - alpha * next_log_probs
+    return rewards + gamma * (1 - terminated) * next_value
+
+
+def critic_loss(q, targets, weight):
+    """The sum over the twins of `weight` × mean squared error: q (2, B), targets (B,)."""
+    return weight * (q - targets).square().mean(1).sum()
+
+
+def actor_loss(log_probs, q, alpha):
+    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). Equation 7."""
+    return (alpha * log_probs - q.amin(0)).mean()
+
+
+def alpha_loss(log_alpha, log_probs, target_entropy):
+    """−log α × (log π + target entropy), averaged: raises α while the entropy is below its target. log_probs (B,).
+
+    TF-Agents' default: equation 18 of arXiv:1812.05905 has α in place of log α, with the same sign of the gradient.
+    """
+    return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
+
+
+class SACAgent:
+    """Actor, twin critics with their targets, and the temperature α, with their optimizers."""
+
+    def __init__(self, config, observation_space, action_space, device, ranks):
+        self.config, self.device, self.ranks = config, device, ranks
+        self.action_shape = action_space.shape
+        self.observation_size = observation_size = math.prod(observation_space.shape)
+        self.action_size = action_size = math.prod(action_space.shape)
+        self.target_entropy = config.target_entropy_per_action * action_size
+        self.scaling = ObservationScaling(observation_size).to(device)
+        self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
+        critic_arguments = (observation_size, action_size, config.critic_layers, config.critic_layer_norm)
+        self.critics = TwinCritics(*critic_arguments).to(device)
+        self.target_critics = TwinCritics(*critic_arguments).to(device).requires_grad_(False)
+        self.target_critics.load_state_dict(self.critics.state_dict())
+        self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
+        self.policy = Policy(self.scaling, self.actor, action_space).to(device)
+
+        self.critic_parameters = list(self.critics.parameters())
+        self.target_parameters = list(self.target_critics.parameters())
+        self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
+        adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
+        self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
+        # One optimizer for the actor and α, who learn from the same sample of actions.
+        groups = [
+            {"params": self.actor_parameters[:-1], "lr": config.actor_learning_rate},
+            {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
+        ]
+        self.actor_optimizer = torch.optim.Adam(groups, **adam)
+
+    def random_actions(self, count):
+        """Uniform actions (K, *action shape) in [-1, 1], numpy."""
+        return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
+
+    @torch.no_grad()
+    def act(self, observations):
+        """Sampled actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy."""
+        observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
+        actions, _ = self.actor.sample(self.scaling(observations))
+        return actions.view(-1, *self.action_shape).cpu().numpy()
+
+    def update(self, batch):
+        """One gradient step of the critics, then of the actor and α, then of the target critics.
+
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
+        number back here would make a GPU wait at every step.
+        """
+        config = self.config
+        observations, actions, rewards, terminated, next_observations = batch
+        observations, next_observations = self.scaling(observations), self.scaling(next_observations)
+        rewards = config.reward_scale_factor * rewards
+        alpha = self.log_alpha.detach().exp()
+
+        with torch.no_grad():
+            next_actions, next_log_probs = self.actor.sample(next_observations)
+            next_q = self.target_critics(next_observations, next_actions)
+            targets = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)
+        q = self.critics(observations, actions)
+        loss_q = critic_loss(q, targets, config.critic_loss_weight)
+        self._step(self.critic_optimizer, loss_q, self.critic_parameters)
+
+        new_actions, log_probs = self.actor.sample(observations)
+        loss_pi = actor_loss(log_probs, self.critics(observations, new_actions), alpha)
+        loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
+        self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
+
+        torch._foreach_lerp_(self.target_parameters, self.critic_parameters, config.target_update_tau)
+        return {
+            "critic_loss": loss_q.detach(),
+            "actor_loss": loss_pi.detach(),
+            "alpha_loss": loss_alpha.detach(),
+            "alpha": alpha,
+            "entropy": -log_probs.detach().mean(),
+            "mean_q": q.detach().mean(),
+        }
+
+    def _step(self, optimizer, loss, parameters):
+        optimizer.zero_grad()
+        loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
+        self.ranks.average_gradients(parameters)
+        optimizer.step()
+
+    def state(self):
+        """Everything that an update depends on and changes, for a checkpoint."""
+        return {
+            "scaling": self.scaling.state_dict(),
+            "actor": self.actor.state_dict(),
+            "critics": self.critics.state_dict(),
+            "target_critics": self.target_critics.state_dict(),
+            "log_alpha": self.log_alpha.detach(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+            "actor_optimizer": self.actor_optimizer.state_dict(),
+        }
+
+    def load_state(self, state):
+        with torch.no_grad():
+            self.log_alpha.copy_(state["log_alpha"])
+        for name in state.keys() - {"log_alpha"}:
+            getattr(self, name).load_state_dict(state[name])
+
+
+# Evaluation
+
+
+@torch.inference_mode()
+def evaluate(policy, env_id, seed):
+    """Return and length of one episode with the deterministic `policy`, or with random actions where it is None."""
+    with make_env(env_id) as env:
+        env.action_space.seed(seed)
+        observation, _ = env.reset(seed=seed)
+        episode_return, length, done = 0.0, 0, False
+        while not done:
+            action = act(policy, observation) if policy else env.action_space.sample()
+            observation, reward, terminated, truncated, _ = env.step(action)
+            episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
+    return episode_return, length
+
+
+@torch.inference_mode()
+def act(policy, observation):
+    """The policy's action for one raw observation, numpy to numpy."""
+    return policy(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
+
+
+def film(policy, env_id, seed, path):
+    """Films one episode of the policy, or of random actions where it is None."""
+    env = make_env(env_id, render_mode="rgb_array")
+    env.action_space.seed(seed)
+    common.record_video(path, env, lambda o: act(policy, o) if policy else env.action_space.sample(), seed)
+
+
+# Training
+
+
+def check(config):
+    """Raises InputError for a value that no run could use."""
+    common.require_positive(
+        config,
+        *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
+        *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
+        "checkpoint_interval",
+    )
+    collected = min(config.initial_collect_steps, config.replay_buffer_capacity)
+    if config.batch_size > collected:
+        raise InputError(f"--batch-size {config.batch_size} is more than the {collected} transitions collected first")
+
+
+def train(config):
+    """Trains as `config` says and returns the run directory's path.
+
+    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays.
+
+    A resumed run equals one that was never interrupted: a checkpoint is taken between two iterations and holds the
+    agent, the replay, the random generators and the evaluations under way, and of the running episodes their seeds and
+    actions, which bring the simulator back to the same state (`common.SeededEpisodes`).
+    """
+    check(config)
+    with make_env(config.env_id) as env:
+        observation_space, action_space, spec = env.observation_space, env.action_space, env.spec
+    with common.Run(config, "sac_minitaur", evaluate) as run:
+        ranks, saved = run.ranks, run.checkpoint
+        episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
+        envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=True))
+        torch.manual_seed(config.seed)  # the same networks on every rank
+        agent = SACAgent(config, observation_space, action_space, run.device, ranks)
+        buffer = ReplayBuffer(config.replay_buffer_capacity, agent.observation_size, agent.action_size, run.device)
+        policy_file = common.PolicyFile(agent.policy, observation_space.shape)
+        torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
+        run.print_start(observation_space, action_space, buffer.rows.nbytes)
+
+        step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
+        if saved:
+            agent.load_state(saved["agent"])
+            buffer.load_state(saved["buffer"])
+            common.set_random_state(saved["random"])
+            run.restart_evaluations(agent.policy)
+        else:
+            run.start_evaluation(step, env_steps, policy=None)
+
+        def save():
+            if run.writes:
+                policy_file.save(run.path / "policy.pt2", agent.policy)
+            shared = {"step": step, "env_steps": env_steps, "agent": agent.state()}
+            own = {"buffer": buffer.state(), "episodes": episodes.state(), "random": common.random_state()}
+            run.save_checkpoint(shared, own)
+
+        if not saved:
+            save()
+        last_saved = step
+        stopping = False
+        steps_per_round = config.num_envs * ranks.world_size
+        observations, _ = envs.reset()
+        while step < config.num_iterations and not stopping:
+            exploring = env_steps < config.initial_collect_steps
+            actions = agent.random_actions(config.num_envs) if exploring else agent.act(observations)
+            envs.step_async(actions)  # the physics runs beside the updates, which sample what was stored before
+            env_steps += steps_per_round
+
+            metrics = {}
+            updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
+            while step < min(updates_due, config.num_iterations):
+                metrics = agent.update(buffer.sample(config.batch_size // ranks.world_size))
+                step += 1
+                run.progress.update()
+                if step % config.log_interval == 0:
+                    run.log_training(step, env_steps, episodes, metrics)
+                if step % config.eval_interval == 0:
+                    run.start_evaluation(step, env_steps, agent.policy)
+
+            next_observations, rewards, terminated, truncated, infos = envs.step_wait()
+            done = terminated | truncated
+            buffer.add(observations, actions, rewards, terminated, common.last_observations(next_observations, infos))
+            episodes.record(actions, rewards, done)
+            observations = next_observations
+            common.require_finite(step, metrics)
+
+            if exploring and env_steps >= config.initial_collect_steps:
+                if config.observation_scaling:
+                    agent.scaling.fit(buffer.observations(), ranks)
+                run.start_evaluation(step, env_steps, agent.policy)
+            if env_steps // steps_per_round % 100 == 0:
+                run.report_evaluations(policy_file)
+                stopping = run.stop_requested()
+            if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:
+                save()
+                last_saved = step
+
+        if step % config.eval_interval and not stopping:
+            run.start_evaluation(step, env_steps, agent.policy)
+        run.finish(policy_file, agent.policy, film if config.video else None, spec.reward_threshold)
+        return run.path
+
+
+def main():
+    config = tyro.cli(Config, description=__doc__)
+    if config.resume:
+        config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved), HARMLESS_FIELDS)
+    if config.evaluate:
+        common.evaluate_policy_file(config, make_env, evaluate, film)
+    else:
+        train(config)
+
+
+if __name__ == "__main__":
+    common.run_main(main)
