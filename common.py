@@ -609,13 +609,13 @@ class Run:
         """Whether any rank was asked to stop (Ctrl-C or SIGTERM)."""
         return self.ranks.any(self.stop.requested)
 
-    def finish(self, policy_file, policy, film, reward_threshold):
+    def finish(self, step, policy_file, policy, film, reward_threshold):
         """Waits for the evaluations, draws the curve, films, and says where everything lies.
 
         After a stop nothing is waited for or filmed: the checkpoint has what is open. `film(policy, env_id, seed,
         path)` films one episode, or is None. A video or a curve that fails costs a line, not the run.
         """
-        stopped = self.progress.n < self.progress.total
+        stopped = step < self.config.num_iterations
         while self.evaluations.pending and not stopped:
             self.report_evaluations(policy_file)
             stopped = self.stop_requested()
@@ -642,7 +642,7 @@ class Run:
         except Exception as error:
             self.print(f"warning: no learning curve ({first_line(error)})")
         if stopped:
-            self.print(f"stopped at step {self.progress.n}; to continue: python {self.script}.py --resume {self.path}")
+            self.print(f"stopped at step {step}; to continue: python {self.script}.py --resume {self.path}")
         else:
             files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
             self.print(f"finished; {self.path} holds {files}")

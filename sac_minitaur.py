@@ -57,13 +57,15 @@ class Config:
     """step of the target critics towards the critics, after every update"""
     gamma: float = 0.99
     """discount"""
-    reward_scale_factor: float = 100.0
-    """ours (theirs: 1): rewards are about 0.01 a step, lost in the noise of a new critic"""
+    reward_scale_factor: float = 1.0
+    """factor of the rewards"""
+    reward_scaling: bool = True
+    """ours (theirs: none): divide the rewards by their spread in the initial random data"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
     """ours, and the paper's −|A| (TF-Agents' default, which the tutorials leave unsaid: −|A|/2, so −0.5)"""
-    initial_log_alpha: float = -2.0
+    initial_log_alpha: float = -5.0
     """ours (TF-Agents' default, which the tutorials leave unsaid: 0)"""
     actor_layers: tuple[int, ...] = (256, 256)
     """hidden units of the actor"""
@@ -327,7 +329,7 @@ def mlp(inputs, hidden_layers, outputs, layer_norm=False):
     """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization)."""
     layers = []
     for units in hidden_layers:
-        layers += [nn.Linear(inputs, units), *([nn.LayerNorm(units)] if layer_norm else []), nn.ReLU()]
+        layers += [nn.Linear(inputs, units), *([nn.LayerNorm(units)] if layer_norm else []), nn.ReLU(inplace=True)]
         inputs = units
     layers.append(nn.Linear(inputs, outputs))
     for layer in layers:
@@ -446,9 +448,10 @@ class ReplayBuffer:
         observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
 
-    def observations(self):
-        """The observations stored so far: (size, O)."""
-        return self.rows[: self.size, : self.sizes[0]]
+    def observations_and_rewards(self):
+        """All that is stored of these: (size, O), (size,)."""
+        observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return observations, rewards.squeeze(1)
 
     def state(self):
         """A copy of the filled part, for a checkpoint."""
@@ -499,6 +502,7 @@ class SACAgent:
         self.action_size = action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
         self.scaling = ObservationScaling(observation_size).to(device)
+        self.reward_scale = torch.tensor(config.reward_scale_factor, device=device)
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         critic_arguments = (observation_size, action_size, config.critic_layers, config.critic_layer_norm)
         self.critics = TwinCritics(*critic_arguments).to(device)
@@ -523,6 +527,14 @@ class SACAgent:
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
+    def fit_scaling(self, observations, rewards):
+        """Fixes the scales of observations (N, O) and rewards (N,) from the initial random data of all ranks."""
+        if self.config.observation_scaling:
+            self.scaling.fit(observations, self.ranks)
+        if self.config.reward_scaling:
+            mean = self.ranks.mean(rewards.mean())
+            self.reward_scale /= self.ranks.mean((rewards - mean).square().mean()).sqrt().clamp(min=1e-6)
+
     @torch.no_grad()
     def act(self, observations):
         """Sampled actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy."""
@@ -539,7 +551,7 @@ class SACAgent:
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
         observations, next_observations = self.scaling(observations), self.scaling(next_observations)
-        rewards = config.reward_scale_factor * rewards
+        rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
         with torch.no_grad():
@@ -579,15 +591,18 @@ class SACAgent:
             "critics": self.critics.state_dict(),
             "target_critics": self.target_critics.state_dict(),
             "log_alpha": self.log_alpha.detach(),
+            "reward_scale": self.reward_scale,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
         }
 
     def load_state(self, state):
-        with torch.no_grad():
-            self.log_alpha.copy_(state["log_alpha"])
-        for name in state.keys() - {"log_alpha"}:
-            getattr(self, name).load_state_dict(state[name])
+        for name, saved in state.items():
+            own = getattr(self, name)
+            if isinstance(own, torch.Tensor):
+                own.detach().copy_(saved)
+            else:
+                own.load_state_dict(saved)
 
 
 # Evaluation
@@ -706,8 +721,7 @@ def train(config):
             common.require_finite(step, metrics)
 
             if exploring and env_steps >= config.initial_collect_steps:
-                if config.observation_scaling:
-                    agent.scaling.fit(buffer.observations(), ranks)
+                agent.fit_scaling(*buffer.observations_and_rewards())
                 run.start_evaluation(step, env_steps, agent.policy)
             if env_steps // steps_per_round % 100 == 0:
                 run.report_evaluations(policy_file)
@@ -718,7 +732,7 @@ def train(config):
 
         if step % config.eval_interval and not stopping:
             run.start_evaluation(step, env_steps, agent.policy)
-        run.finish(policy_file, agent.policy, film if config.video else None, spec.reward_threshold)
+        run.finish(step, policy_file, agent.policy, film if config.video else None, spec.reward_threshold)
         return run.path
 
 
