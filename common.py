@@ -600,10 +600,11 @@ class Run:
                 f"AverageReturn = {row['average_return']:.6f} ± {row['std_return']:.6f}, "
                 f"AverageEpisodeLength = {row['average_episode_length']:.6f} ± {row['std_episode_length']:.6f}"
             )
+            if policy:
+                self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             if policy and row["average_return"] > self.best_return:
                 self.best_return = row["average_return"]
                 policy_file.save(self.path / "best_policy.pt2", policy)
-                self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
 
     def stop_requested(self):
         """Whether any rank was asked to stop (Ctrl-C or SIGTERM)."""
