@@ -533,7 +533,8 @@ class SACAgent:
             self.scaling.fit(observations, self.ranks)
         if self.config.reward_scaling:
             mean = self.ranks.mean(rewards.mean())
-            self.reward_scale /= self.ranks.mean((rewards - mean).square().mean()).sqrt().clamp(min=1e-6)
+            spread = self.ranks.mean((rewards - mean).square().mean()).sqrt()
+            self.reward_scale /= torch.where(spread > 1e-6, spread, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
     def act(self, observations):
@@ -704,7 +705,7 @@ def train(config):
 
             metrics = {}
             updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
-            while step < min(updates_due, config.num_iterations):
+            while not exploring and step < min(updates_due, config.num_iterations):
                 metrics = agent.update(buffer.sample(config.batch_size // ranks.world_size))
                 step += 1
                 run.progress.update()
