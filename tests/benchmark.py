@@ -1,0 +1,144 @@
+"""Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
+
+    python tests/benchmark.py                  # a few minutes; nothing else should run on the machine
+    pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
+
+Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
+drift of the machine's speed touches all alike. Quote the ratios rather than the milliseconds.
+"""
+
+import importlib.util
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import common  # noqa: E402
+import sac_minitaur  # noqa: E402
+
+REPEATS = 5
+TRAINING_STEPS = 1_000
+
+
+def milliseconds(function, calls):
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - start) / calls * 1e3
+
+
+def medians(candidates):
+    """Calls every candidate in turn, `REPEATS` times: name → median of the milliseconds that it returns."""
+    rounds = [{name: candidate() for name, candidate in candidates.items()} for _ in range(REPEATS)]
+    return {name: statistics.median(times[name] for times in rounds) for name in candidates}
+
+
+def environment_candidates():
+    env = sac_minitaur.MinitaurBulletEnv()
+    env.reset(seed=0)
+    action = np.zeros(8, np.float32)  # stands, so that step after step has the same contacts
+    for _ in range(100):
+        env.step(action)
+    yield "environment step", lambda: milliseconds(lambda: env.step(action), 200)
+    bare = env.simulator.stepSimulation
+    yield "five bare stepSimulation calls", lambda: milliseconds(lambda: [bare() for _ in range(5)], 200)
+
+
+def new_agent_and_buffer(num_threads):
+    torch.set_num_threads(num_threads)
+    spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
+    agent = sac_minitaur.SACAgent(sac_minitaur.Config(), *spaces, torch.device("cpu"), common.Ranks())
+    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, agent.device)
+    buffer.rows.normal_()
+    buffer.rows[:, 37] = 0  # nothing terminates
+    buffer.size = 100_000
+    return agent, buffer
+
+
+def update_candidates():
+    agent, buffer = new_agent_and_buffer(1)
+
+    def update(num_threads):
+        torch.set_num_threads(num_threads)
+        return milliseconds(lambda: agent.update(buffer.sample(256)), 100)
+
+    yield "update, 1 thread", lambda: update(1)
+    yield "update, 2 threads", lambda: update(2)
+
+
+def run(*command):
+    """Milliseconds that a command takes as a whole process."""
+    start = time.perf_counter()
+    subprocess.run([sys.executable, *map(str, command)], cwd=ROOT, check=True, capture_output=True)
+    return (time.perf_counter() - start) * 1e3
+
+
+def training(num_iterations, *flags):
+    """Milliseconds an iteration: a long run less a short one, so that start-up and initial collection cancel."""
+    times = []
+    for iterations in (num_iterations + 100, 100):
+        with tempfile.TemporaryDirectory() as directory:
+            times.append(
+                run(
+                    "sac_minitaur.py", "--num-iterations", iterations, "--initial-collect-steps", 500, "--no-video",
+                    "--num-eval-episodes", 1, "--eval-interval", 1_000_000, "--run-dir", Path(directory) / "run", *flags,
+                )  # fmt: skip
+            )
+    return (times[0] - times[1]) / num_iterations
+
+
+def peer_training(module, num_iterations):
+    """The same of `SAC` of stable_baselines3 or sbx, with the tutorials' sizes, in a process of its own."""
+    code = f"""
+import time, torch, sac_minitaur, gymnasium as gym
+from {module} import SAC
+torch.set_num_threads(2)
+model = SAC("MlpPolicy", gym.make("MinitaurBulletEnv-v0"), learning_starts=500, batch_size=256, buffer_size=100_000)
+model.learn(600)
+start = time.perf_counter()
+model.learn({num_iterations}, reset_num_timesteps=False)
+print((time.perf_counter() - start) / {num_iterations} * 1e3)
+"""
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return float(out.splitlines()[-1])
+
+
+def training_candidates():
+    yield "training, 1 thread", lambda: training(TRAINING_STEPS)
+    yield "training, 2 threads", lambda: training(TRAINING_STEPS, "--num-threads", 2)
+    for name, module in (("Stable-Baselines3", "stable_baselines3"), ("SBX", "sbx")):
+        if importlib.util.find_spec(module):
+            yield f"training, {name}", lambda module=module: peer_training(module, TRAINING_STEPS)
+
+
+def dqn():
+    with tempfile.TemporaryDirectory() as directory:
+        return run("dqn_cartpole.py", "--no-video", "--run-dir", Path(directory) / "run")
+
+
+def main():
+    common.keep_freed_memory()
+    print(f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}")
+    for candidates, base in (
+        (dict(environment_candidates()), "five bare stepSimulation calls"),
+        (dict(update_candidates()), "update, 1 thread"),
+        (dict(training_candidates()), "training, 1 thread"),
+        ({"DQN, the whole default command": dqn}, "DQN, the whole default command"),
+    ):
+        result = medians(candidates)
+        for name, time_ in result.items():
+            print(f"{name:32} {time_:10.2f} ms   × {time_ / result[base]:.2f} of {base}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
