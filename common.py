@@ -12,10 +12,12 @@ import errno
 import functools
 import io
 import json
+import logging
 import math
 import multiprocessing
 import os
 import pickle
+import re
 import signal
 import sys
 import threading
@@ -752,48 +754,67 @@ class PolicyFile:
         write_atomically(path, lambda file: file.write(archive.getvalue()))
 
 
+# What each string of an exported graph may be, by its key: names, operators that compute and nothing else, the symbol of
+# the batch size. PyTorch compiles names and guards as Python code, evaluates symbols and looks operators up anywhere.
+_OPERATOR = r"torch\.ops\.aten\.[a-z]\w*\.[A-Za-z]\w*"
+_PLAIN = {
+    "target": _OPERATOR,
+    "as_operator": _OPERATOR,
+    "name": r"\w+",
+    "as_name": r"\w+",
+    "expr_str": r"Symbol\('\w+'(, \w+=True)*\)",
+    "as_string": "(?!)",  # no policy needs one, and some operators take a file's name
+    # one argument in, one tensor out
+    "in_spec": re.escape(torch.utils._pytree.treespec_dumps(torch.utils._pytree.tree_structure(((0,), {})))),
+    "out_spec": re.escape(torch.utils._pytree.treespec_dumps(torch.utils._pytree.tree_structure(0))),
+}
+
+
+def _plain_graph(tree, key=None):
+    """An exported graph without its nodes' notes. Raises ValueError for a string that loading it could execute."""
+    if isinstance(tree, dict):
+        return {name: {} if name == "metadata" else _plain_graph(value, name) for name, value in tree.items()}
+    if isinstance(tree, list):
+        return [_plain_graph(value, key) for value in tree]
+    if isinstance(tree, str) and not re.fullmatch(_PLAIN.get(key, r"[\w.+]*"), tree):
+        raise ValueError(f"its graph holds {tree[:60]!r}")
+    return tree
+
+
+def _plain_record(name, data):
+    """One record of an exported policy's archive. Raises ValueError when it is more than tensors and a graph of them."""
+    if name == "models/model.json":
+        return json.dumps(_plain_graph(json.loads(data)))
+    if name in ("data/weights/model_weights_config.json", "data/constants/model_constants_config.json"):
+        config = json.loads(data)
+        if any(entry["use_pickle"] for entry in config["config"].values()):
+            raise ValueError("it holds pickled objects")
+        return json.dumps(config)
+    if name == "data/sample_inputs/model.pt":
+        torch.load(io.BytesIO(data), weights_only=True)
+    elif not re.fullmatch(r"data/weights/weight_\d+|archive_format|archive_version|byteorder|\.data/\w+", name):
+        raise ValueError(f"it holds {name[:60]!r}")
+    return data
+
+
 def load_policy(path):
     """Loads an exported policy as a callable module. Raises InputError for a missing, damaged, foreign or hostile file.
 
-    `torch.export.load` falls back to unpickling what it does not know and evaluates the graph's symbolic shapes, so
-    everything in the archive that is not plain data is refused before it is called.
+    `torch.export.load` unpickles and evaluates what it finds, so it is given a copy that holds nothing but what
+    `PolicyFile` writes: copied, because two readers of one archive can be made to see different records.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = {name.partition("/")[2]: name for name in archive.namelist()}
-            if "models/model.json" not in names:
-                raise ValueError("it holds no exported program")
-            for short, name in names.items():
-                if short.endswith("config.json"):
-                    entries = json.loads(archive.read(name))["config"].values()
-                    if any(entry["use_pickle"] for entry in entries):
-                        raise ValueError("it holds pickled objects")
-                elif short == "data/sample_inputs/model.pt":
-                    torch.load(io.BytesIO(archive.read(name)), weights_only=True)
-                elif short == "models/model.json":
-                    if any(not symbol.isidentifier() for symbol in _values(json.loads(archive.read(name)), "expr_str")):
-                        raise ValueError("it holds a symbolic expression")
-                elif not short.startswith((".data/", "data/weights/weight_", "data/constants/tensor_")) and short not in (
-                    "archive_format", "archive_version", "byteorder", "version"
-                ):  # fmt: skip
-                    raise ValueError(f"it holds {short}")
-        return torch.export.load(path).module()
+        checked = io.BytesIO()
+        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(checked, "w") as copy:
+            for name in dict.fromkeys(archive.namelist()):
+                copy.writestr(name, _plain_record(name.partition("/")[2], archive.read(name)))
+        checked.seek(0)
+        logging.getLogger("torch.export").setLevel(logging.ERROR)  # it would log what is raised here in one line
+        return torch.export.load(checked).module()
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: --evaluate takes a policy.pt2 file") from None
     except Exception as error:  # whatever a damaged or hostile file provokes
         raise InputError(f"{path} is not a whole exported policy ({first_line(error)})") from None
-
-
-def _values(tree, key):
-    if isinstance(tree, dict):
-        for name, value in tree.items():
-            if name == key:
-                yield str(value)
-            else:
-                yield from _values(value, key)
-    elif isinstance(tree, list):
-        for value in tree:
-            yield from _values(value, key)
 
 
 # What a person looks at
