@@ -1,0 +1,82 @@
+"""Makes README's tables and figures from the CSVs beside this file: `python results/report.py`.
+
+`results/<experiment>/seed<k>/` holds the `eval.csv`, `train.csv` and `config.json` of one run, `tutorials.csv` what the
+TF-Agents tutorials print.
+"""
+
+import csv
+from pathlib import Path
+from statistics import median
+
+from matplotlib.figure import Figure
+
+RESULTS = Path(__file__).resolve().parent
+FIGURES = {
+    "sac_minitaur": ("SAC on the Minitaur", 15.0, ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023")),
+    "dqn_cartpole": ("DQN on CartPole-v0", 195.0, ("dqn_cartpole_tf2.6", "dqn_cartpole_tf2.11")),
+}
+
+
+def read(path):
+    with open(path) as file:
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def runs(experiment):
+    """The evaluations of an experiment: seed → rows of its `eval.csv`."""
+    return {path.parent.name: read(path) for path in sorted((RESULTS / experiment).glob("seed*/eval.csv"))}
+
+
+def tutorials():
+    """The tutorials' evaluations: run → (steps, returns)."""
+    curves = {}
+    with open(RESULTS / "tutorials.csv") as file:
+        for row in csv.DictReader(file):
+            steps, returns = curves.setdefault(row["run"], ([], []))
+            steps.append(int(row["step"]))
+            returns.append(float(row["average_return"]))
+    return curves
+
+
+def print_table(experiment):
+    print(f"\n### {experiment}\n\n| seed | final return | episode length | best evaluation | worst after half |")
+    print("| --- | --- | --- | --- | --- |")
+    finals = []
+    for seed, rows in runs(experiment).items():
+        last = rows[-1]
+        best = max(row["average_return"] for row in rows)
+        late = min(row["average_return"] for row in rows if row["step"] >= last["step"] / 2)
+        finals.append((last["average_return"], last["average_episode_length"]))
+        spread = f"{last['average_return']:.2f} ± {last['std_return']:.2f}"
+        print(f"| {seed[4:]} | {spread} | {last['average_episode_length']:.0f} | {best:.2f} | {late:.2f} |")
+    returns, lengths = zip(*finals)
+    print(f"| median | {median(returns):.2f} | {median(lengths):.0f} | | |")
+
+
+def draw(experiment, title, threshold, names):
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    curves = runs(experiment)
+    for rows in curves.values():
+        axes.plot([r["step"] for r in rows], [r["average_return"] for r in rows], color="C0", linewidth=0.7, alpha=0.6)
+    steps = sorted(set.intersection(*({row["step"] for row in rows} for rows in curves.values())))
+    at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
+    middle = [median(returns[step] for returns in at) for step in steps]
+    axes.plot(steps, middle, color="C0", linewidth=2.5, label=f"ours, median of {len(curves)} seeds (each thin)")
+    for i, name in enumerate(names):
+        axes.plot(*tutorials()[name], color="C1", linestyle="-:"[i % 2], linewidth=1, label=name.replace("_", " "))
+    axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
+    axes.set(title=title, xlabel="gradient updates", ylabel="average return")
+    axes.legend(fontsize="small")
+    figure.savefig(RESULTS / f"{experiment}.png", dpi=110)
+
+
+def main():
+    for experiment in sorted(path.name for path in RESULTS.iterdir() if path.is_dir()):
+        print_table(experiment)
+    for experiment, figure in FIGURES.items():
+        draw(experiment, *figure)
+
+
+if __name__ == "__main__":
+    main()
