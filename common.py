@@ -35,6 +35,8 @@ import torch.distributed as dist
 from tqdm import tqdm
 
 CHECKPOINT_FORMAT = 1
+# Fields of a config that a resumed run may change: they decide what is written and where, not what is learned.
+HARMLESS_FIELDS = ("run_dir", "resume", "evaluate", "video", "checkpoint_interval")
 # Sets the seeds of evaluation episodes apart from those of training, whose second number counts environments.
 EVALUATION_KEY = 2**32 - 1
 # Workers are forked where that is safe: they start at once and share the memory of the imported libraries. They never
@@ -446,6 +448,9 @@ class Run:
             self.path = Path(config.resume)
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
             self.checkpoint = shared | own
+            for name, saved in self.checkpoint["config"].items():
+                if name not in (*HARMLESS_FIELDS, "num_iterations") and saved != getattr(config, name, None):
+                    raise InputError(f"{self.path}/checkpoint.pt is another run's: its {name} is {saved}")
         else:
             default = Path("runs") / f"{script}-{time.strftime('%Y%m%d-%H%M%S')}-seed{config.seed}"
             self.path = Path(self.ranks.broadcast(config.run_dir or default))
@@ -653,6 +658,7 @@ class Run:
     def save_checkpoint(self, shared, own):
         """Saves the training state that all ranks share, rank by rank their own, and the run's."""
         shared = shared | {
+            "config": dataclasses.asdict(self.config),
             "tables": self.tables,
             "best_return": self.best_return,
             "seconds": time.monotonic() - self.started,
@@ -711,10 +717,10 @@ def first_line(error):
     return (str(error).splitlines() or [type(error).__name__])[0][:150]
 
 
-def resumed_config(config, parse, harmless):
+def resumed_config(config, parse):
     """The config that `--resume` continues with: the saved one, with what the command line changes.
 
-    `parse(default)` reads the command line over the defaults given. `num_iterations` may grow; the `harmless` fields
+    `parse(default)` reads the command line over the defaults given. `num_iterations` may grow; the harmless fields
     may differ. Raises InputError naming the first field that may not.
     """
     path = Path(config.resume) / "config.json"
@@ -731,7 +737,7 @@ def resumed_config(config, parse, harmless):
         flag = "--" + field.name.replace("_", "-")
         if field.name == "num_iterations" and new < old:
             raise InputError(f"{flag} {new} is less than the {old} of the run to resume: it may only be raised")
-        if old != new and field.name not in (*harmless, "num_iterations", "resume"):
+        if old != new and field.name not in (*HARMLESS_FIELDS, "num_iterations"):
             raise InputError(f"{flag} {new} differs from the {old} of the run to resume: leave it out")
     return config
 

@@ -100,10 +100,6 @@ class Config:
     """updates between checkpoints, the policy's export among them"""
 
 
-# Fields that a resumed run may change: they decide what is written and where, not what is learned.
-HARMLESS_FIELDS = ("run_dir", "evaluate", "video", "checkpoint_interval")
-
-
 # The environment
 
 
@@ -740,7 +736,7 @@ def train(config):
 def main():
     config = tyro.cli(Config, description=__doc__)
     if config.resume:
-        config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved), HARMLESS_FIELDS)
+        config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
     if config.evaluate:
         common.evaluate_policy_file(config, make_env, evaluate, film)
     else:
