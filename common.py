@@ -68,6 +68,8 @@ def run_main(main):
     try:
         main()
     except (InputError, RunError) as error:
+        if int(os.environ.get("RANK", 0)) > 0:
+            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun then ends this one, and one line is said
         print(f"error: {error}", file=sys.stderr, flush=True)
         # Ranks that wait for each other in a collective would keep an orderly exit from ending.
         sys.stdout.flush()
@@ -700,6 +702,9 @@ def load_checkpoint(path, script, ranks):
     another number of processes.
     """
     try:
+        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the checksums
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
         format_, found, shared, own = (state[key] for key in ("format", "script", "shared", "ranks"))
     except FileNotFoundError:
