@@ -201,10 +201,13 @@ class Ranks:
 
 
 def die_with_parent():
-    """For a worker process: leaves Ctrl-C to the main process and exits as soon as that process is gone."""
+    """For a worker process: leaves Ctrl-C and SIGTERM, which a whole group is often sent, to the main process.
+
+    It exits as soon as that process is gone.
+    """
     if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         threading.Thread(
             target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True
         ).start()
@@ -732,6 +735,10 @@ def resumed_config(config, parse):
     try:
         saved = json.loads(path.read_text())
         saved = type(config)(**{key: tuple(v) if isinstance(v, list) else v for key, v in saved.items()})
+        for field in dataclasses.fields(saved):
+            value = getattr(saved, field.name)
+            if not isinstance(value, tuple) and not isinstance(value, field.type):
+                raise TypeError(f"{field.name} is {value!r}")
     except FileNotFoundError:
         raise InputError(f"--resume {config.resume}: there is no run there (no {path.name})") from None
     except (OSError, ValueError, TypeError, AttributeError) as error:

@@ -1,0 +1,213 @@
+"""Runs of the two scripts in processes of their own, to be killed and looked at.
+
+Importing everything takes seconds, so a server process does it once and forks itself for every run. A run is a session
+of its own (setsid), so that whatever outlives it can be found. A hook is a function of a test module that is called
+with the script's module in the new process, before its `main`.
+"""
+
+import csv
+import importlib
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+SCRIPTS = ("sac_minitaur", "dqn_cartpole")
+AGENTS = {"sac_minitaur": "SACAgent", "dqn_cartpole": "DQNAgent"}
+TINY = {
+    "sac_minitaur": "--env-id Pendulum-v1 --actor-layers 32 32 --critic-layers 32 32",
+    "dqn_cartpole": "--layers 32",
+}
+COMMON = (
+    "--device cpu --no-video --num-iterations 300 --initial-collect-steps 96 --batch-size 24 --replay-buffer-capacity 250 "
+    "--log-interval 20 --eval-interval 60 --num-eval-episodes 3 --checkpoint-interval 50"
+)
+
+
+def flags(script, run_dir, *more):
+    """The command line of a tiny run. Its replay wraps around, and its checkpoints fall into episodes."""
+    return [*TINY[script].split(), *COMMON.split(), "--run-dir", str(run_dir), *map(str, more)]
+
+
+class Process:
+    """One run, started at once; `output` is a new directory for what it prints."""
+
+    server = None
+
+    def __init__(self, script, arguments, output, hook=None, **environ):
+        if Process.server is None:
+            Process.server = subprocess.Popen(
+                [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+            )
+        self.output = Path(output)
+        self.output.mkdir(parents=True)
+        self.status = None
+        self.pid = self._ask("start", (script, list(map(str, arguments)), str(output), pickle.dumps(hook), environ))
+
+    def _ask(self, *request):
+        pickle.dump(request, self.server.stdin)
+        self.server.stdin.flush()
+        return pickle.load(self.server.stdout)
+
+    def poll(self):
+        if self.status is None:
+            self.status = self._ask("poll", self.pid)
+        return self.status
+
+    def wait(self, seconds=600):
+        """The exit status, negative for a signal, once the process and all that it started are gone."""
+        wait_until(lambda: self.poll() is not None, seconds)
+        wait_until(lambda: not session(self.pid), seconds=60)
+        return self.status
+
+    def kill(self, number=signal.SIGKILL):
+        os.kill(self.pid, number)
+
+    @property
+    def stdout(self):
+        return (self.output / "stdout").read_text()
+
+    @property
+    def stderr(self):
+        return (self.output / "stderr").read_text()
+
+
+def wait_until(condition, seconds):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def session(leader):
+    """The processes of a session that live, as pids."""
+    pids = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, _, leader_of_this = path.read_text().rpartition(")")[2].split()[:4]
+        except OSError:
+            continue
+        if int(leader_of_this) == leader and state not in "ZX":
+            pids.append(int(path.parent.name))
+    return pids
+
+
+def rank_environ(rank, world_size, port):
+    """What torchrun tells a process."""
+    return {
+        "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(world_size),
+        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
+    }  # fmt: skip
+
+
+def free_port():
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def start_ranks(world_size, script, arguments, output, hook=None):
+    """The processes of a distributed run, as torchrun would start them but without its watch over them."""
+    port = free_port()
+    return [
+        Process(script, arguments, Path(output) / str(rank), hook, **rank_environ(rank, world_size, port))
+        for rank in range(world_size)
+    ]
+
+
+def rows(path):
+    """A CSV's rows without times, as text, after a check that all its lines are whole."""
+    text = path.read_text()
+    assert text.endswith("\n")
+    lines = list(csv.reader(text.splitlines()))
+    assert len(set(map(len, lines))) == 1
+    keep = [i for i, name in enumerate(lines[0]) if name not in ("seconds", "steps_per_second")]
+    return [[line[i] for i in keep] for line in lines]
+
+
+def checkpoint(run_dir):
+    """What a checkpoint holds, without times and paths."""
+    import torch
+
+    state = torch.load(run_dir / "checkpoint.pt", weights_only=True)
+    shared = state["shared"]
+    del shared["seconds"]
+    for name in ("run_dir", "resume", "video", "checkpoint_interval"):
+        del shared["config"][name]
+    for row in [row for table in shared["tables"].values() for row in table] + [row for row, _ in shared["evaluations"]]:
+        row.pop("seconds")
+        row.pop("steps_per_second", None)
+    return state
+
+
+def assert_same(a, b, where="checkpoint"):
+    """Fails unless two nested states are equal to the last bit (nan equals nan)."""
+    import torch
+
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert list(a) == list(b), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), where
+        for i, pair in enumerate(zip(a, b)):
+            assert_same(*pair, f"{where}[{i}]")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype and torch.equal(a, b), where
+    else:
+        assert a == b or a != a and b != b, where
+
+
+def _serve():
+    """Forks a run whenever it is asked to, and tells how one ended."""
+    requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    sys.path.insert(0, str(ROOT))
+    import matplotlib.figure  # noqa: F401
+    import torch
+    from torch.utils.tensorboard import SummaryWriter  # noqa: F401
+
+    import common
+
+    for script in SCRIPTS:
+        importlib.import_module(script)
+    common.PolicyFile(torch.nn.Linear(1, 1), (1,))  # imports the compiler
+    while True:
+        try:
+            request, argument = pickle.load(requests)
+        except EOFError:
+            return
+        if request == "start":
+            reply = os.fork()
+            if reply == 0:
+                return _run(*argument)
+        else:
+            pid, status = os.waitpid(argument, os.WNOHANG)
+            reply = os.waitstatus_to_exitcode(status) if pid else None
+        pickle.dump(reply, replies)
+        replies.flush()
+
+
+def _run(script, arguments, output, hook, environ):
+    os.setsid()
+    for descriptor, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(f"{output}/{name}", os.O_WRONLY | os.O_CREAT | os.O_APPEND), descriptor)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.environ.update(environ)
+    import common
+
+    module = sys.modules[script]
+    sys.argv = [f"{script}.py", *arguments]
+    if hook := pickle.loads(hook):
+        hook(module)
+    common.run_main(module.main)
+
+
+if __name__ == "__main__":
+    _serve()

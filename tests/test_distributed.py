@@ -1,0 +1,206 @@
+"""Several processes train one agent: on the CPU, over gloo, started as torchrun does or by torchrun itself."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import torch
+
+import common
+from runs import AGENTS, ROOT, assert_same, checkpoint, flags, rows, session, start_ranks, wait_until
+from test_resume import assert_same_run, before_call, die, script  # noqa: F401 (a fixture)
+
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+
+
+def end(ranks, statuses=None):
+    assert [rank.wait() for rank in ranks] == (statuses or [0] * len(ranks)), [rank.stderr for rank in ranks]
+
+
+# Gradients
+
+
+def new_agent(module, ranks):
+    """A tiny agent whose critics do not move, so that the actor's gradients are those of the same critics."""
+    torch.manual_seed(0)
+    if module.__name__ == "dqn_cartpole":
+        config = module.Config(layers=(16,))
+    else:
+        config = module.Config(env_id="Pendulum-v1", actor_layers=(16,), critic_layers=(16,), critic_learning_rate=0.0)
+    with gym.make(config.env_id) as env:
+        spaces = env.observation_space, env.action_space
+    return getattr(module, AGENTS[module.__name__])(config, *spaces, torch.device("cpu"), ranks)
+
+
+def joined_batch(module):
+    torch.manual_seed(1)
+    observations, next_observations = torch.randn(2, 24, 4 if module.__name__ == "dqn_cartpole" else 3)
+    actions = torch.randint(2, (24,)) if module.__name__ == "dqn_cartpole" else torch.rand(24, 1) * 2 - 1
+    return observations, actions, torch.randn(24), (torch.rand(24) < 0.3).float(), next_observations
+
+
+def gradients_of_update(module, ranks):
+    """The gradients that one update leaves on this rank, which has its share of the joined batch."""
+    torch.set_num_threads(1)
+    torch.randn_like = torch.zeros_like  # the actor's samples, which ranks draw apart
+    agent = new_agent(module, ranks)
+    agent.update([part[ranks.rank :: ranks.world_size] for part in joined_batch(module)])
+    groups = [g for name, o in vars(agent).items() if name.endswith("optimizer") for g in o.param_groups]
+    return [parameter.grad for group in groups for parameter in group["params"]]
+
+
+def save_gradients(module, directory):
+    def main():
+        ranks = common.Ranks.join()
+        torch.save(gradients_of_update(module, ranks), f"{directory}/{ranks.world_size}-{ranks.rank}.pt")
+
+    module.main = main
+
+
+def test_averaged_gradients_equal_those_of_the_joined_batch(script, tmp_path):  # noqa: F811
+    for world_size in (1, 2, 3):
+        end(start_ranks(world_size, script, [], tmp_path / str(world_size), partial(save_gradients, directory=tmp_path)))
+    expected = torch.load(tmp_path / "1-0.pt")
+    assert all(gradient.abs().max() > 0 for gradient in expected)
+    for world_size in (2, 3):
+        for rank in range(world_size):
+            averaged = torch.load(tmp_path / f"{world_size}-{rank}.pt")
+            for gradient, right in zip(averaged, expected, strict=True):
+                torch.testing.assert_close(gradient, right, rtol=1e-5, atol=1e-6 * float(right.abs().max()))
+
+
+# Whole runs
+
+
+def save_agent_at(module, directory, count):
+    """Saves each rank's agent, as it is after that many updates."""
+    agent_class = getattr(module, AGENTS[module.__name__])
+    update, calls = agent_class.update, iter(range(1, 10**9))
+
+    def update_and_save(self, batch):
+        metrics = update(self, batch)
+        if next(calls) == count:
+            torch.save(self.state(), f"{directory}/{self.ranks.rank}.pt")
+        return metrics
+
+    agent_class.update = update_and_save
+
+
+def tiny(name, run_dir):
+    return flags(name, run_dir, "--num-envs", 2, "--collect-steps-per-iteration", 2, "--num-iterations", 240)
+
+
+@pytest.fixture(scope="module", params=[("sac_minitaur", 3), ("dqn_cartpole", 2)])
+def trained(request, tmp_path_factory):
+    """A run of N processes that was left alone: its directory, its processes and N."""
+    script, world_size = request.param
+    path = tmp_path_factory.mktemp(script)
+    hook = partial(save_agent_at, directory=path, count=200)
+    ranks = start_ranks(world_size, script, tiny(script, path / "run"), path / "output", hook)
+    end(ranks)
+    return path / "run", ranks, world_size
+
+
+def test_parameters_are_the_same_on_all_ranks(trained):
+    """To the last bit after 200 updates, although each has experience of its own."""
+    run_dir, _, world_size = trained
+    agents = [torch.load(run_dir.parent / f"{rank}.pt") for rank in range(world_size)]
+    for agent in agents[1:]:
+        assert_same(agent, agents[0])
+    own = checkpoint(run_dir)["ranks"]
+    assert len(own) == world_size
+    assert all(not torch.equal(rank["buffer"]["rows"], own[0]["buffer"]["rows"]) for rank in own[1:])
+
+
+def test_rank_0_alone_prints_and_writes(trained):
+    run_dir, ranks, _ = trained
+    assert "finished" in ranks[0].stdout
+    assert all(rank.stdout == "" for rank in ranks[1:])
+    assert all(rank.stderr == "" for rank in ranks), [rank.stderr for rank in ranks]
+    assert len(list(run_dir.glob("events.*"))) == 1
+
+
+def test_collect_ratio_holds_over_all_ranks(trained):
+    """Two environment steps for each update, of all environments of all processes, after the initial ones."""
+    run_dir, _, world_size = trained
+    for step, env_steps in (map(int, row[:2]) for row in rows(run_dir / "train.csv")[1:]):
+        assert 96 + 2 * step <= env_steps < 96 + 2 * step + 2 * (2 * world_size), (step, env_steps)
+
+
+def test_evaluation_does_not_depend_on_how_it_is_shared(trained, tmp_path):
+    """Every episode of a fixed list is played once: the final policy's row is what one process gets."""
+    run_dir, _, _ = trained
+    script = checkpoint(run_dir)["script"]
+    module = importlib.import_module(script)
+    config = checkpoint(run_dir)["shared"]["config"]
+    policy = common.load_policy(run_dir / "policy.pt2")
+    seeds = [common.episode_seed(config["seed"], common.EVALUATION_KEY, i) for i in range(3)]
+    returns, _ = zip(*(module.evaluate(policy, config["env_id"], seed) for seed in seeds))
+    header, *_, last = rows(run_dir / "eval.csv")
+    assert last[0] == "240"
+    assert float(last[header.index("average_return")]) == pytest.approx(sum(returns) / 3, rel=1e-4)
+
+
+def test_killed_and_resumed_exactly_with_as_many_processes(trained, tmp_path):
+    run_dir, _, world_size = trained
+    script = checkpoint(run_dir)["script"]
+    ranks = start_ranks(world_size, script, tiny(script, tmp_path / "run"), tmp_path / "1", kill_rank_1)
+    # The others lose it, say so, and end, without anybody to end them.
+    assert [rank.wait() for rank in ranks] == [1, -signal.SIGKILL, 1][:world_size]
+    assert ranks[0].stderr.startswith("error: lost another process") and ranks[0].stderr.count("\n") == 1
+    assert 0 < checkpoint(tmp_path / "run")["shared"]["step"] < 240
+    other = start_ranks(5 - world_size, script, ["--resume", tmp_path / "run"], tmp_path / "2")
+    end(other, [2] * (5 - world_size))
+    assert f"saved by {world_size} processes" in other[0].stderr and other[0].stderr.count("\n") == 1
+    end(start_ranks(world_size, script, ["--resume", tmp_path / "run"], tmp_path / "3"))
+    assert_same_run(tmp_path / "run", run_dir)
+
+
+def kill_rank_1(module):
+    if os.environ["RANK"] == "1":
+        before_call(getattr(module, AGENTS[module.__name__]), "update", 130, die)
+
+
+def test_two_processes_solve_cartpole(tmp_path):
+    arguments = ["--device", "cpu", "--no-video", "--num-iterations", 5000, "--run-dir", tmp_path / "run"]
+    end(start_ranks(2, "dqn_cartpole", arguments, tmp_path / "output"))
+    header, *evaluations = rows(tmp_path / "run" / "eval.csv")
+    assert max(float(row[header.index("average_return")]) for row in evaluations) >= 195
+
+
+# torchrun itself
+
+
+def test_torchrun_ends_when_a_rank_is_killed(tmp_path):
+    command = [*TORCHRUN, ROOT / "sac_minitaur.py", *flags("sac_minitaur", tmp_path / "run", "--num-iterations", 10**6)]
+    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    ranks = {rank_of(pid): int(pid) for pid in children if rank_of(pid)}
+    os.kill(ranks["1"], signal.SIGKILL)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode != 0
+    assert "error: lost another process" in errors or "SIGKILL" in errors
+    wait_until(lambda: not session(ranks["0"]) and not session(ranks["1"]), seconds=60)  # one session per rank
+    assert "shared" in checkpoint(tmp_path / "run")
+
+
+def rank_of(pid):
+    environ = dict(entry.split("=", 1) for entry in Path(f"/proc/{pid}/environ").read_text().split("\0") if "=" in entry)
+    return environ.get("RANK")
+
+
+def test_torchrun_refuses_a_batch_that_cannot_be_shared(tmp_path):
+    command = [*TORCHRUN, ROOT / "sac_minitaur.py", *flags("sac_minitaur", tmp_path / "run", "--batch-size", 25)]
+    result = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert [line for line in result.stderr.splitlines() if line.startswith("error: ")] == [
+        "error: --batch-size 25 cannot be shared by 2 processes"
+    ]
+    assert "exitcode  : 2" in result.stderr
+    assert not (tmp_path / "run").exists()

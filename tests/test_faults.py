@@ -1,0 +1,405 @@
+"""Damaged and hostile files, full disks, dead workers, losses that are not numbers: one line, and nothing is lost."""
+
+import io
+import json
+import os
+import pickle
+import resource
+import shutil
+import signal
+import subprocess
+import zipfile
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import common
+from runs import AGENTS, SCRIPTS, Process, checkpoint, flags, rows, session, wait_until
+from test_resume import assert_same_run, before_call, finish, reference, script  # noqa: F401 (fixtures)
+
+
+def assert_one_line(run, status, *words):
+    assert run.wait() == status, (run.stdout, run.stderr)
+    lines = run.stderr.strip().split("\n")
+    assert len(lines) == 1 and lines[0].startswith("error: "), run.stderr
+    assert all(word in lines[0] for word in words), lines[0]
+
+
+# Files
+
+
+def rewrite(source, target, records):
+    """Copies a zip archive with the records given replaced or added."""
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as copy:
+        root = archive.namelist()[0].partition("/")[0]
+        records = {f"{root}/{name}": data for name, data in records.items()}
+        for name in archive.namelist():
+            if name not in records:
+                copy.writestr(name, archive.read(name))
+        for name, data in records.items():
+            copy.writestr(name, data)
+
+
+def read(path, name):
+    with zipfile.ZipFile(path) as archive:
+        return archive.read(f"{archive.namelist()[0].partition('/')[0]}/{name}")
+
+
+class CreatesFile:
+    """Its pickle creates a file where it is loaded."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def saved(*objects):
+    torch.save(objects if len(objects) > 1 else objects[0], buffer := io.BytesIO())
+    return buffer.getvalue()
+
+
+def flip_a_byte(path):
+    """In the largest record's data, which no parser looks at."""
+    with zipfile.ZipFile(path) as archive:
+        info = max(archive.infolist(), key=lambda info: info.file_size)
+    data = bytearray(path.read_bytes())
+    data[info.header_offset + 200 + info.file_size // 2] ^= 1
+    path.write_bytes(data)
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGES = {
+    "truncated": truncate,
+    "a flipped bit": flip_a_byte,
+    "empty": lambda path: path.write_bytes(b""),
+    "text": lambda path: path.write_text("a shopping list\n"),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"format": 1})),
+    "another archive": lambda path: path.write_bytes(saved({"weights": torch.zeros(3)})),
+    "a list": lambda path: path.write_bytes(saved([1, 2])),
+}
+
+
+def change(path, **values):
+    torch.save(torch.load(path, weights_only=True) | values, path)
+
+
+def change_config(path, **values):
+    state = torch.load(path, weights_only=True)
+    state["shared"]["config"] |= values
+    torch.save(state, path)
+
+
+FOREIGN = {
+    "another script's": (partial(change, script="td3_ant"), "td3_ant"),
+    "another format's": (partial(change, format=0), "format 0"),
+    "another environment's": (partial(change_config, env_id="Ant-v5"), "env_id is Ant-v5"),
+    "another network's": (partial(change_config, gamma=0.5), "gamma is 0.5"),
+}
+
+
+@pytest.fixture
+def copy(reference, tmp_path):  # noqa: F811
+    """A finished run, to be damaged."""
+    return shutil.copytree(reference, tmp_path / "run")
+
+
+def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
+    whole = (copy / "checkpoint.pt").read_bytes()
+    cases = {name: (damage, "checkpoint.pt") for name, damage in DAMAGES.items()} | FOREIGN
+    for name, (damage, word) in cases.items():
+        (copy / "checkpoint.pt").write_bytes(whole)
+        damage(copy / "checkpoint.pt")
+        assert_one_line(Process(script, ["--resume", copy], tmp_path / name), 2, word)
+    (copy / "checkpoint.pt").unlink()
+    assert_one_line(Process(script, ["--resume", copy], tmp_path / "missing"), 2, "checkpoint.pt")
+
+
+def test_damaged_config(script, copy, tmp_path):  # noqa: F811
+    config = json.loads((copy / "config.json").read_text())
+    texts = "", "[1, 2]", json.dumps(config | {"wings": 2}), json.dumps(config | {"num_iterations": "many"})
+    for i, text in enumerate(texts):
+        (copy / "config.json").write_text(text)
+        assert_one_line(Process(script, ["--resume", copy], tmp_path / str(i)), 2, "config.json")
+
+
+def test_one_script_does_not_continue_the_other(script, reference, tmp_path):  # noqa: F811
+    other = SCRIPTS[1 - SCRIPTS.index(script)]
+    assert_one_line(Process(other, ["--resume", reference], tmp_path / "resume"), 2, "config.json")
+    env = ["--env-id", "Pendulum-v1"] if other == "sac_minitaur" else []
+    run = Process(other, ["--evaluate", reference / "policy.pt2", "--no-video", *env], tmp_path / "evaluate")
+    assert_one_line(run, 2, "policy.pt2", "--env-id")
+
+
+def test_damaged_or_foreign_policy(script, copy, tmp_path):  # noqa: F811
+    path = copy / "policy.pt2"
+    whole = path.read_bytes()
+    cases = DAMAGES | {"a checkpoint": lambda path: shutil.copy(copy / "checkpoint.pt", path)}
+    for name, damage in cases.items():
+        path.write_bytes(whole)
+        damage(path)
+        with pytest.raises(common.InputError, match="policy.pt2") as error:
+            common.load_policy(path)
+        assert "\n" not in str(error.value), name
+    assert_one_line(Process(script, ["--evaluate", path], tmp_path / "evaluate"), 2, "policy.pt2")
+    assert_one_line(Process(script, ["--evaluate", tmp_path / "no.pt2"], tmp_path / "missing"), 2, "no.pt2")
+
+
+def test_whole_policy_is_evaluated(script, reference, tmp_path):  # noqa: F811
+    env = ["--env-id", "Pendulum-v1"] if script == "sac_minitaur" else []
+    arguments = ["--evaluate", reference / "policy.pt2", "--no-video", "--num-eval-episodes", 1, *env]
+    assert "AverageReturn = " in finish(script, arguments, tmp_path / "output").stdout
+
+
+def test_hostile_checkpoint_is_not_executed(reference, tmp_path):  # noqa: F811
+    created = tmp_path / "created"
+    state = torch.load(reference / "checkpoint.pt", weights_only=True)
+    for data in (saved(state | {"format": CreatesFile(created)}), pickle.dumps(CreatesFile(created))):
+        (tmp_path / "checkpoint.pt").write_bytes(data)
+        with pytest.raises(common.InputError):
+            common.load_checkpoint(tmp_path / "checkpoint.pt", "sac_minitaur", common.Ranks())
+        assert not created.exists()
+
+
+def hostile_policies(path, created):
+    """(name, bytes) of policies that would create a file when they are loaded or called."""
+    evil, python = CreatesFile(created), f"__import__('os').open({str(created)!r}, 64)"
+    graph = json.loads(read(path, "models/model.json"))
+    weights = json.loads(read(path, "data/weights/model_weights_config.json"))
+    constants = json.loads(read(path, "data/constants/model_constants_config.json"))
+
+    def with_graph(edit):
+        edit(edited := json.loads(json.dumps(graph)))
+        return {"models/model.json": json.dumps(edited)}
+
+    def add_node(target, *arguments_and_graph):
+        *arguments, edited = arguments_and_graph
+        inputs = [{"name": "", "arg": argument, "kind": 1} for argument in arguments]
+        node = {"target": target, "inputs": inputs, "outputs": [], "metadata": {}, "name": "added"}
+        edited["graph_module"]["graph"]["nodes"].insert(0, node)
+
+    def symbol(edited):
+        sizes = [v["sizes"][0] for v in edited["graph_module"]["graph"]["tensor_values"].values() if v["sizes"]]
+        next(size for size in sizes if "as_expr" in size)["as_expr"]["expr_str"] = python
+
+    def rename(edited):
+        text = json.dumps(edited).replace('"observation"', json.dumps(f"observation={python}"))
+        edited.clear()
+        edited.update(json.loads(text))
+
+    entry = next(iter(weights["config"].values()))
+    pickled = {"config": weights["config"] | {"x": entry | {"use_pickle": True, "path_name": "weight_0"}}}
+    opaque = {"config": {"x": {"path_name": "opaque_obj_0", "is_param": False, "use_pickle": False} | {
+        "tensor_meta": entry["tensor_meta"]}}}  # fmt: skip
+    records = {
+        "sample inputs": {"data/sample_inputs/model.pt": saved((evil,))},
+        "pickled weight": {
+            "data/weights/model_weights_config.json": json.dumps(pickled),
+            "data/weights/weight_0": saved(evil),
+        },
+        "weights of an old format": {"data/weights/model.pt": saved(evil)},
+        "constants of an old format": {"data/constants/model.pt": saved(evil)},
+        "opaque constant": {
+            "data/constants/model_constants_config.json": json.dumps(constants | opaque),
+            "data/constants/opaque_obj_0": pickle.dumps(evil),
+        },
+        "symbol": with_graph(symbol),
+        "guard": with_graph(lambda edited: edited.update(guards_code=[python])),
+        "function": with_graph(partial(add_node, "torch.os.mkdir", {"as_string": str(created)})),
+        "operator on files": with_graph(
+            partial(add_node, "torch.ops.aten.from_file.default", {"as_string": str(created)}, {"as_bool": True})
+        ),
+        "name": with_graph(rename),
+    }
+    for name, replaced in records.items():
+        rewrite(path, target := path.with_name("hostile.pt2"), replaced)
+        yield name, target.read_bytes()
+    with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:  # the format before PyTorch 2.8
+        archive.writestr("version", f"{graph['schema_version']['major']}.{graph['schema_version']['minor']}")
+        archive.writestr("serialized_exported_program.json", json.dumps(graph))
+        for part in ("state_dict", "constants", "example_inputs"):
+            archive.writestr(f"serialized_{part}.pt", saved(evil))
+    yield "old format", buffer.getvalue()
+    rewrite(path, path.with_name("hostile.pt2"), with_graph(symbol))
+    with zipfile.ZipFile(path.with_name("hostile.pt2"), "a") as archive:
+        archive.writestr(f"{archive.namelist()[0].partition('/')[0]}/models/model.json", json.dumps(graph))
+    yield "two graphs, of which two readers see different ones", path.with_name("hostile.pt2").read_bytes()
+    yield "pickle", pickle.dumps(evil)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_hostile_policy_is_not_executed(reference, tmp_path):  # noqa: F811
+    """Neither when it is loaded nor when it is called. PyTorch's own loader shows that the files do what they should."""
+    path, created = tmp_path / "policy.pt2", tmp_path / "created"
+    observation = torch.zeros(2, 3 if "sac_minitaur" in str(reference) else 4)
+    live = set()
+    for name, data in hostile_policies(shutil.copy(reference / "policy.pt2", path), created):
+        (tmp_path / "hostile.pt2").write_bytes(data)
+        for load in (torch.export.load, common.load_policy):
+            try:
+                program = load(tmp_path / "hostile.pt2")
+                (program.module() if load is torch.export.load else program)(observation)
+            except Exception as error:
+                assert load is torch.export.load or isinstance(error, common.InputError), name
+            if created.exists():
+                assert load is torch.export.load, name
+                live.add(name)
+                created.rmdir() if created.is_dir() else created.unlink()
+    assert len(live) > 5, live
+
+
+# Disks
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 4 MB."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", path], capture_output=True, text=True)
+    if mount.returncode:
+        pytest.skip(f"mounting a small disk is not permitted here: {mount.stderr.strip()}")
+    yield path
+    subprocess.run(["umount", path], check=True)
+
+
+def fill(path):
+    with open(path, "wb", buffering=0) as file:
+        try:
+            while file.write(bytes(4096)):
+                pass
+        except OSError:
+            pass
+
+
+def test_full_disk(script, small_disk, reference, tmp_path):  # noqa: F811
+    """The run says so and stops. With room again it continues, to the same end."""
+    hook = partial(fill_disk, path=small_disk / "other people's")
+    run = Process(script, flags(script, small_disk / "run", "--num-envs", 2), tmp_path / "output", hook)
+    assert_one_line(run, 1, "No space left on device", "checkpoint is kept")
+    state = checkpoint(small_disk / "run")
+    assert 0 < state["shared"]["step"] < 300
+    for path in (small_disk / "run").glob("*.csv"):
+        rows(path)
+    (small_disk / "other people's").unlink()
+    finish(script, ["--resume", small_disk / "run"], tmp_path / "resumed")
+    assert_same_run(small_disk / "run", reference)
+
+
+def fill_disk(module, path):
+    before_call(getattr(module, AGENTS[module.__name__]), "update", 110, lambda: fill(path))
+
+
+def test_full_disk_from_the_start(script, small_disk, tmp_path):  # noqa: F811
+    fill(small_disk / "other people's")
+    run = Process(script, flags(script, small_disk / "run"), tmp_path / "output")
+    run.wait()
+    assert run.status and len(run.stderr.strip().split("\n")) == 1, run.stderr
+
+
+def test_rows_are_whole_or_not_there(tmp_path):
+    """A write that the disk has room for in part only."""
+    path = tmp_path / "train.csv"
+    common.append_whole(path, b"step,loss\n1,2\n")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
+    try:
+        with pytest.raises(OSError):
+            common.append_whole(path, b"2," + b"3" * 100 + b"\n")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == b"step,loss\n1,2\n"
+
+
+# Processes. `Process.wait` asserts each time that nothing of the run has outlived it.
+
+
+def test_dead_environment_worker(tmp_path):
+    run = Process("sac_minitaur", flags("sac_minitaur", tmp_path / "run", "--num-envs", 2), tmp_path / "1", kill_environment)
+    assert_one_line(run, 1, "worker process died", "--resume")
+    assert checkpoint(tmp_path / "run")["shared"]["step"] == 0
+
+
+def kill_environment(module):
+    step = gym.vector.AsyncVectorEnv.step_async
+    calls = iter(range(100))
+
+    def step_async(self, actions):
+        step(self, actions)
+        if next(calls) == 30:
+            os.kill(self.processes[1].pid, signal.SIGKILL)
+
+    gym.vector.AsyncVectorEnv.step_async = step_async
+
+
+def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
+    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", die_evaluating)
+    assert_one_line(run, 1, "worker process died", "--resume")
+
+
+def die_evaluating(module):
+    before_call(module, "act", 3, lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
+    arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
+    run = finish(script, arguments, tmp_path / "output", die_filming)
+    assert "warning: no video" in run.stdout and not run.stderr
+    assert (tmp_path / "run" / "learning_curve.png").exists()
+
+
+def die_filming(module):
+    before_call(common, "record_video", 1, lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
+    """Which is killed in the midst of everything, while its workers work."""
+    run = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "output")
+    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    assert len(session(run.pid)) > 1
+    run.kill()
+    assert run.wait() == -signal.SIGKILL
+
+
+# Losses
+
+
+class NanReward(gym.RewardWrapper):
+    """Gives rewards that are not numbers from its 30th step on."""
+
+    left = 30
+
+    def reward(self, reward):
+        self.left -= 1
+        return reward if self.left > 0 else np.nan
+
+
+def with_nan_rewards(module):
+    make_training_env = module.make_training_env
+    module.make_training_env = lambda env_id: NanReward(make_training_env(env_id))
+
+
+def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811
+    """Stops the run at once, with the step and the part, and no checkpoint has taken it in."""
+    few = ["--initial-collect-steps", 24, "--checkpoint-interval", 1, "--eval-interval", 10**6]
+    run = Process(script, flags(script, tmp_path / "run", *few), tmp_path / "output", with_nan_rewards)
+    assert_one_line(run, 1, "loss is nan at step ", "checkpoint is kept")
+    step = int(run.stderr.split("at step ")[1].split(";")[0])
+    state = checkpoint(tmp_path / "run")["shared"]
+    assert state["step"] == step - 1
+    assert all(tensor.isfinite().all() for tensor in tensors(state["agent"]) if tensor.dim())
+
+
+def tensors(tree):
+    if isinstance(tree, torch.Tensor):
+        yield tree
+    elif isinstance(tree, (dict, list, tuple)):
+        for value in tree.values() if isinstance(tree, dict) else tree:
+            yield from tensors(value)
