@@ -259,7 +259,8 @@ class DQNAgent:
         self.ranks.average_gradients(self.parameters)
         self.optimizer.step()
 
-        torch._foreach_lerp_(self.target_parameters, self.parameters, config.target_update_tau)
+        with torch.no_grad():
+            torch._foreach_lerp_(self.target_parameters, self.parameters, config.target_update_tau)
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
 
     def state(self):
