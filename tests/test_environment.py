@@ -1,0 +1,372 @@
+"""The Minitaur against pybullet's own class, bit for bit, and against what gymnasium and Stable-Baselines3 expect."""
+
+import contextlib
+import dataclasses
+import importlib
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+import types
+import warnings
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import sac_minitaur
+
+ROOT = Path(__file__).parent.parent
+ENV_ID = "MinitaurBulletEnv-v0"
+pybullet = pytest.importorskip("pybullet")
+
+
+# Actions. With each of them the legs start where a reset leaves them standing.
+
+
+def trot(step, frequency=2.0, swing=0.5, extension=0.3):
+    """Diagonal legs in phase, without looking at the robot: it walks slowly and stays up for a whole episode."""
+    phase = 2 * math.pi * frequency * step * 0.01 + np.array([0, math.pi, math.pi, 0])
+    return np.concatenate((swing * np.sin(phase), extension * np.cos(phase)))
+
+
+def reckless_trot(step):
+    """Walks for one to some hundred steps and tends to fall."""
+    return trot(step, frequency=1.5, swing=0.65, extension=0.45)
+
+
+def crouch(step):
+    """Pulls all legs in against their stops: falls, and after more than a second of stalling a motor overheats."""
+    return -np.ones(8)
+
+
+def random_actions(seed, hold=1):
+    """Each held for `hold` steps: for 10, the robot falls soon; for 1 it trembles and stands."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (1000, 8))
+    return lambda step: actions[step // hold]
+
+
+# pybullet's own class
+
+
+@contextlib.contextmanager
+def old_gym():
+    """Stands in for the retired packages that pybullet_envs imports, and takes all it imported out again."""
+    names = "gym gym.spaces gym.utils gym.utils.seeding pkg_resources pybullet_envs pybullet_envs.bullet".split()
+    stubs = {name: types.ModuleType(name) for name in names}
+    stubs["gym"].__version__, stubs["gym"].Env = "0.21.0", object
+    stubs["gym"].spaces, stubs["gym"].utils = stubs["gym.spaces"], stubs["gym.utils"]
+    stubs["gym.spaces"].Box = lambda low, high, dtype: gym.spaces.Box(low.astype(dtype), high.astype(dtype))
+    stubs["gym.utils"].seeding = stubs["gym.utils.seeding"]
+    stubs["gym.utils.seeding"].np_random = lambda seed=None: (np.random.default_rng(seed), seed)
+    stubs["pkg_resources"].parse_version = lambda version: tuple(map(int, version.split(".")))
+    # The packages' own __init__ would register every environment with the old gym.
+    folder = Path(importlib.util.find_spec("pybullet_envs").submodule_search_locations[0])
+    stubs["pybullet_envs"].__path__ = [str(folder)]
+    stubs["pybullet_envs.bullet"].__path__ = [str(folder / "bullet")]
+    with mock.patch.dict(sys.modules, stubs), mock.patch.object(sys, "path", sys.path.copy()):
+        yield
+
+
+class Pair:
+    """Our environment and the original, the original's randomization fed with what ours drew."""
+
+    def __init__(self):
+        with old_gym():
+            module = importlib.import_module("pybullet_envs.bullet.minitaur_gym_env")
+            self.original = module.MinitaurBulletEnv()
+        self.original.set_env_randomizer(self)
+        self.env = gym.make(ENV_ID)
+
+    def randomize_env(self, original):
+        dynamics, minitaur = self.env.unwrapped.dynamics, original.minitaur
+        minitaur.SetBaseMass(dynamics.base_mass)
+        minitaur.SetLegMasses([dynamics.leg_mass, dynamics.motor_mass])
+        minitaur.SetBatteryVoltage(dynamics.voltage)
+        minitaur.SetMotorViscousDamping(dynamics.viscous_damping)
+        minitaur.SetFootFriction(dynamics.foot_friction)
+
+    def play(self, seed, act, dtype, num_steps=None, options=None):
+        """Steps both and compares: to the end of the episode, or for `num_steps` whatever happens.
+
+        Returns the number of steps, and whether and when the robot fell and a motor was switched off.
+        """
+        observation, _ = self.env.reset(seed=seed, options=options)
+        assert_same_observation(observation, self.original.reset())
+        fell_at = overheated_at = None
+        for step in range(num_steps or 1000):
+            action = act(step).astype(dtype)
+            observation, reward, terminated, truncated, _ = self.env.step(action)
+            expected, expected_reward, expected_done, _ = self.original.step(action)
+            assert_same_observation(observation, expected)
+            assert reward == expected_reward and terminated == expected_done, step
+            assert truncated == (step + 1 >= 1000)
+            motors = self.original.minitaur._motor_enabled_list
+            assert self.env.unwrapped.motor_enabled.tolist() == motors
+            if terminated and fell_at is None:
+                fell_at = step
+            if not all(motors) and overheated_at is None:
+                overheated_at = step
+            if num_steps is None and (terminated or truncated):
+                break
+        return step + 1, fell_at, overheated_at
+
+    def close(self):
+        self.env.close()
+        self.original._pybullet_client.disconnect()
+
+
+def assert_same_observation(observation, expected):
+    assert observation.dtype == np.float32 and expected.dtype == np.float64
+    assert (observation == expected.astype(np.float32)).all(), np.abs(observation - expected).max()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    pair = Pair()
+    yield pair
+    pair.close()
+
+
+@pytest.fixture(scope="module")
+def env():
+    with gym.make(ENV_ID) as env:
+        yield env
+
+
+# numpy 1 computes the original's Python float × float32 scalar in float64.
+numpy_2 = pytest.mark.skipif(np.__version__.startswith("1."), reason="the original's float32 arithmetic is numpy 2's")
+float32 = pytest.param(np.float32, marks=numpy_2, id="float32")
+float64 = pytest.param(np.float64, id="float64")
+
+
+@pytest.mark.parametrize("dtype", [float32, float64])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_equals_the_original_with_random_actions(pair, seed, dtype):
+    pair.play(seed, random_actions(seed), dtype, num_steps=60)
+    steps, fell_at, _ = pair.play(seed, random_actions(seed, hold=10), dtype)
+    assert fell_at == steps - 1 and steps < 500
+
+
+@numpy_2
+def test_equals_the_original_over_a_whole_walk(pair):
+    steps, fell_at, _ = pair.play(0, trot, np.float32)
+    assert steps == 1000 and fell_at is None  # so the time limit ended it
+    assert pair.env.unwrapped.x > 1  # and it was a walk
+
+
+@numpy_2
+def test_equals_the_original_in_a_fall_after_a_walk(pair):
+    # Where it falls depends on the last bit of the machine's sine; it did with 132 to 366 steps.
+    falls = [pair.play(seed, reckless_trot, np.float32, num_steps=400)[1] for seed in (1, 3)]
+    assert any(fell_at is not None and fell_at > 100 for fell_at in falls)
+
+
+def test_equals_the_original_walking_with_float64_actions(pair):
+    steps, fell_at, _ = pair.play(4, trot, np.float64, num_steps=300)
+    assert fell_at is None
+
+
+def test_equals_the_original_when_motors_overheat(pair):
+    _, fell_at, overheated_at = pair.play(0, crouch, np.float64, num_steps=220)
+    assert overheated_at is not None and 100 < overheated_at < 200  # the steps after the switch-off are compared too
+    # The next reset switches the motors on again, in both.
+    assert pair.play(0, trot, np.float64, num_steps=20)[2] is None
+
+
+def test_equals_the_original_with_dynamics_of_ones_own(pair):
+    dynamics = sac_minitaur.Dynamics(3.0, 0.1, 0.3, 15.0, 0.005, 1.0)
+    pair.play(0, trot, np.float64, num_steps=50, options={"dynamics": dynamics})
+    assert pair.env.unwrapped.dynamics is dynamics
+
+
+@pytest.mark.parametrize("value", [1.02, -1.02, np.nan, np.inf])
+def test_refuses_actions_out_of_bounds_as_the_original_does(pair, value):
+    pair.env.reset(seed=0)
+    action = np.zeros(8, np.float32)
+    pair.env.step(action + np.float32(1.005))  # the original's tolerance
+    action[5] = value
+    for step in (pair.env.step, pair.original.step):
+        with pytest.raises(ValueError):
+            step(action)
+
+
+# Reset
+
+
+def test_draws_dynamics_in_their_ranges(env):
+    simulator = env.unwrapped.simulator
+    env.unwrapped._build()
+    base, leg, motor = (simulator.getDynamicsInfo(env.unwrapped.robot, link)[0] for link in (-1, 2, 1))
+    ranges = {
+        "base_mass": (0.8 * base, 1.2 * base),
+        "leg_mass": (0.8 * leg, 1.2 * leg),
+        "motor_mass": (0.8 * motor, 1.2 * motor),
+        "voltage": (14.8, 16.8),
+        "viscous_damping": (0, 0.01),
+        "foot_friction": (0.8, 1.5),
+    }
+    draws = []
+    for seed in range(25):
+        env.reset(seed=seed)
+        draws.append(dataclasses.asdict(env.unwrapped.dynamics))
+    assert list(draws[0]) == list(ranges)
+    for name, (low, high) in ranges.items():
+        values = np.array([draw[name] for draw in draws])
+        assert (low <= values).all() and (values <= high).all(), name
+        # With 25 uniform draws, the odds against half of the range being left out at one end are 3e7 to 1.
+        middle = (low + high) / 2
+        assert values.min() < middle < values.max(), name
+    # The draws are independent of each other.
+    correlations = np.corrcoef(np.array([list(draw.values()) for draw in draws]).T)
+    assert np.abs(correlations - np.eye(6)).max() < 0.8
+    # SI units: a robot of some 5 kg.
+    assert 1 < base < 10 and 0.01 < leg < 1 and 0.05 < motor < 1
+
+
+def test_the_drawn_masses_and_friction_are_the_simulated_ones(env):
+    env.reset(seed=3)
+    robot, dynamics = env.unwrapped.robot, env.unwrapped.dynamics
+    legs = [2, 3, 5, 6, 8, 9, 11, 12, 15, 16, 18, 19, 21, 22, 24, 25]
+    feet = [3, 6, 9, 12, 16, 19, 22, 25]
+    motors = [1, 4, 7, 10, 14, 17, 20, 23]
+    info = {link: env.unwrapped.simulator.getDynamicsInfo(robot, link) for link in range(-1, 26)}
+    assert info[-1][0] == dynamics.base_mass
+    assert {info[link][0] for link in legs} == {dynamics.leg_mass}
+    assert {info[link][0] for link in motors} == {dynamics.motor_mass}
+    assert {info[link][1] for link in feet} == {dynamics.foot_friction}
+
+
+def rollout(env, seed, num_steps=60, options=None):
+    """The bits of everything that the first steps of an episode return."""
+    act = random_actions(0)
+    observation, _ = env.reset(seed=seed, options=options)
+    bits = [observation.tobytes()]
+    for step in range(num_steps):
+        observation, reward, terminated, truncated, _ = env.step(act(step).astype(np.float32))
+        bits += [observation.tobytes(), reward, terminated, truncated]
+    return bits
+
+
+def test_a_seed_fixes_the_episode(env):
+    first = rollout(env, seed=7)
+    dynamics = env.unwrapped.dynamics
+    other = rollout(env, seed=8)
+    assert rollout(env, seed=7) == first and env.unwrapped.dynamics == dynamics
+    assert other != first
+    # An unseeded reset goes on drawing from the same generator.
+    env.reset()
+    assert env.unwrapped.dynamics not in (dynamics, None)
+
+
+def test_a_used_simulator_gives_the_bits_of_a_fresh_one(env):
+    env.reset(seed=1)
+    for step in range(180):  # a robot on its back with a motor overheated
+        env.step(crouch(step))
+    used = rollout(env, seed=5)
+    with gym.make(ENV_ID) as fresh:
+        assert rollout(fresh, seed=5) == used
+
+
+def test_dynamics_can_be_given(env):
+    env.reset(seed=0)
+    dynamics = env.unwrapped.dynamics
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        dynamics.base_mass = 1.0
+    drawn = rollout(env, seed=0)
+    given = rollout(env, seed=1, options={"dynamics": dynamics})
+    assert env.unwrapped.dynamics == dynamics and given == drawn  # the seed decides nothing else
+    for field in dataclasses.fields(dynamics):
+        changed = dataclasses.replace(dynamics, **{field.name: 0.9 * getattr(dynamics, field.name)})
+        assert rollout(env, seed=0, num_steps=10, options={"dynamics": changed}) != drawn[: 1 + 4 * 10], field.name
+
+
+# What other programs see
+
+
+def test_spaces_are_those_of_the_original(pair):
+    assert pair.env.observation_space == pair.original.observation_space
+    assert pair.env.action_space == pair.original.action_space
+
+
+def test_spaces_are_those_that_the_tutorials_print(env):
+    high = np.repeat(np.float32(["3.1515927", "167.72488", "5.71", "1.01"]), [8, 8, 8, 4])
+    space = env.observation_space
+    assert space.dtype == np.float32 and (space.high == high).all() and (space.low == -high).all()
+    space = env.action_space
+    assert space.shape == (8,) and space.dtype == np.float32 and (space.high == 1).all() and (space.low == -1).all()
+    assert env.spec.reward_threshold == 15.0 and env.spec.max_episode_steps == 1000
+
+
+def test_passes_gymnasiums_check():
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(ENV_ID).unwrapped)
+
+
+def test_passes_stable_baselines_check():
+    env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env_checker.check_env(gym.make(ENV_ID, render_mode="rgb_array"))  # its render check closes the environment
+
+
+def test_renders_without_a_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with gym.make(ENV_ID, render_mode="rgb_array") as env:
+        env.reset(seed=0)
+        standing = env.render()
+        assert standing.shape == (360, 480, 3) and standing.dtype == np.uint8
+        assert standing.std() > 5
+        for step in range(10):
+            env.step(trot(step).astype(np.float32))
+        assert (env.render() != standing).any()
+
+
+def run_python(code, cwd):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, "-c", code], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+def test_any_program_can_make_it(tmp_path):
+    code = f"""
+import gymnasium
+env = gymnasium.make("sac_minitaur:{ENV_ID}")
+observation, info = env.reset(seed=7)
+print(env.spec.max_episode_steps, observation.tobytes().hex(), env.unwrapped.dynamics.base_mass)
+"""
+    process = run_python(code, tmp_path)
+    assert process.returncode == 0, process.stderr
+    with gym.make(ENV_ID) as env:
+        observation, _ = env.reset(seed=7)
+        expected = f"1000 {observation.tobytes().hex()} {env.unwrapped.dynamics.base_mass}"
+    assert process.stdout.splitlines()[-1] == expected  # another process gives the same bits
+
+
+def test_other_tasks_need_no_pybullet(tmp_path):
+    code = f"""
+import sys
+
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.startswith("pybullet"):
+            raise ImportError("No module named " + name)
+
+sys.meta_path.insert(0, Block())
+import sac_minitaur
+env = sac_minitaur.make_training_env("Pendulum-v1")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+try:
+    sac_minitaur.make_env("{ENV_ID}")
+except sac_minitaur.InputError as error:
+    print(error)
+"""
+    process = run_python(code, tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout == f"--env-id {ENV_ID} cannot be made: No module named pybullet\n"

@@ -1,0 +1,718 @@
+"""Soft Actor-Critic piece by piece against numbers worked out by hand, then `train` and the command line as a whole."""
+
+import copy
+import csv
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+import tyro
+from torch import nn
+from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
+
+import common
+import sac_minitaur
+from sac_minitaur import Actor, Config, ObservationScaling, Policy, ReplayBuffer, SACAgent
+
+ROOT = Path(__file__).parent.parent
+TUTORIALS = dict(
+    observation_scaling=False,
+    reward_scaling=False,
+    critic_layer_norm=False,
+    initial_log_alpha=0.0,
+    target_entropy_per_action=-0.5,
+    target_update_tau=0.005,
+    reward_scale_factor=1.0,
+    replay_buffer_capacity=10_000,
+)
+
+
+def make_agent(observation_size=3, action_size=2, device="cpu", **choices):
+    torch.manual_seed(0)
+    config = Config(**{"actor_layers": (16, 16), "critic_layers": (16, 16)} | choices)
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (observation_size,))
+    action_space = gym.spaces.Box(-1, 1, (action_size,))
+    return SACAgent(config, observation_space, action_space, torch.device(device), common.Ranks())
+
+
+def make_batch(size=32, observation_size=3, action_size=2):
+    """As `ReplayBuffer.sample` returns it."""
+    generator = torch.Generator().manual_seed(1)
+    observations, next_observations = torch.randn(2, size, observation_size, generator=generator)
+    actions = 2 * torch.rand(size, action_size, generator=generator) - 1
+    rewards = torch.randn(size, generator=generator)
+    terminated = (torch.rand(size, generator=generator) < 0.3).float()
+    return observations, actions, rewards, terminated, next_observations
+
+
+# The losses
+
+
+def test_td_targets():
+    targets = sac_minitaur.td_targets(
+        rewards=torch.tensor([1.0, 1.0, -2.0]),
+        terminated=torch.tensor([0.0, 1.0, 0.0]),
+        next_q=torch.tensor([[4.0, 4.0, 7.0], [3.0, 3.0, 9.0]]),
+        next_log_probs=torch.tensor([-2.0, -2.0, 4.0]),
+        alpha=torch.tensor(0.5),
+        gamma=0.9,
+    )
+    # The first two differ in `terminated` alone: 1 + 0.9 (3 + 0.5 · 2) and 1. The third: −2 + 0.9 (7 − 0.5 · 4).
+    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.5]))
+
+
+def test_critic_loss():
+    q = torch.tensor([[1.0, 2.0], [3.0, 5.0]], requires_grad=True)
+    loss = sac_minitaur.critic_loss(q, torch.tensor([2.0, 2.0]), weight=0.5)
+    assert loss.item() == 0.5 * ((1 + 0) / 2 + (1 + 9) / 2)
+    loss.backward()
+    assert q.grad.tolist() == [[-0.5, 0.0], [0.5, 1.5]]  # (q − target) / B: towards the target
+
+
+def test_actor_loss():
+    log_probs = torch.tensor([-1.0, -3.0], requires_grad=True)
+    q = torch.tensor([[1.0, 4.0], [2.0, 3.0]], requires_grad=True)
+    loss = sac_minitaur.actor_loss(log_probs, q, torch.tensor(0.5))
+    assert loss.item() == ((-0.5 - 1) + (-1.5 - 3)) / 2
+    loss.backward()
+    assert log_probs.grad.tolist() == [0.25, 0.25]  # less likely actions, so more entropy
+    assert q.grad.tolist() == [[-0.5, 0.0], [0.0, -0.5]]  # more of the smaller twin
+
+
+@pytest.mark.parametrize("log_prob, gradient", [(-2.0, 3.0), (5.0, -4.0)])
+def test_alpha_loss(log_prob, gradient):
+    log_alpha = torch.tensor(2.0, requires_grad=True)
+    log_probs = torch.full((4,), log_prob, requires_grad=True)
+    loss = sac_minitaur.alpha_loss(log_alpha, log_probs, target_entropy=-1.0)
+    assert loss.item() == 2 * gradient
+    loss.backward()
+    # An entropy of 2, above the target, lets α fall; one of −5 lets it rise.
+    assert log_alpha.grad.item() == gradient
+    assert log_probs.grad is None
+
+
+# The networks
+
+
+def test_actor_log_probabilities_are_those_of_torch_distributions():
+    torch.manual_seed(0)
+    actor = Actor(3, 2, (16,)).double()
+    observations = torch.randn(500, 3, dtype=torch.float64)
+    actions, log_probs = actor.sample(observations)
+    mean, log_std = actor(observations)
+    assert mean.shape == log_std.shape == actions.shape == (500, 2) and log_probs.shape == (500,)
+    expected = TransformedDistribution(Independent(Normal(mean, log_std.exp()), 1), TanhTransform()).log_prob(actions)
+    assert actions.abs().max() > 0.95
+    torch.testing.assert_close(log_probs, expected, rtol=1e-6, atol=1e-6)
+    # The samples are the distribution's: standard normal before scaling, shifting and squashing.
+    normal = (actions.atanh() - mean) / log_std.exp()
+    assert normal.mean().abs() < 0.15 and (normal.std() - 1).abs() < 0.15
+
+
+@pytest.mark.parametrize("mean", [20.0, -20.0])
+def test_actor_log_probabilities_where_tanh_saturates(mean):
+    actor = Actor(3, 2, ())
+    with torch.no_grad():
+        actor.net[0].weight.zero_()
+        actor.net[0].bias.copy_(torch.tensor([mean, mean, -100.0, 100.0]))
+    torch.manual_seed(0)
+    actions, log_probs = actor.sample(torch.zeros(5, 3))
+    assert (actions[:, 0] == math.copysign(1, mean)).all()  # the very ends, where atanh is infinite
+    torch.manual_seed(0)
+    noise = torch.randn(5, 2).double()
+    log_std = torch.tensor([-20.0, 2.0], dtype=torch.float64)  # the bounds that ±100 are clamped to
+    u = mean + log_std.exp() * noise
+    log_normal = -noise**2 / 2 - log_std - math.log(2 * math.pi) / 2
+    log_determinant = math.log(4) - 2 * u.abs() - 2 * torch.log1p((-2 * u.abs()).exp())  # log(1 − tanh²u)
+    torch.testing.assert_close(log_probs.double(), (log_normal - log_determinant).sum(1), rtol=1e-5, atol=1e-4)
+    (log_probs.sum() + actions.sum()).backward()
+    assert actor.net[0].bias.grad.isfinite().all()
+
+
+def test_networks_start_glorot_uniform():
+    net = sac_minitaur.mlp(28, (256, 256), 8)
+    linears = [layer for layer in net if isinstance(layer, nn.Linear)]
+    assert [tuple(layer.weight.shape) for layer in linears] == [(256, 28), (256, 256), (8, 256)]
+    for layer in linears:
+        bound = math.sqrt(6 / sum(layer.weight.shape))
+        assert 0.95 * bound < layer.weight.abs().max() <= bound and (layer.bias == 0).all()
+        assert layer.weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.1)
+
+
+def test_twin_critics_are_independent():
+    critics = make_agent().critics
+    observations, actions, *_ = make_batch()
+    q = critics(observations, actions)
+    assert q.shape == (2, 32) and not torch.allclose(q[0], q[1])
+    q[0].sum().backward()
+    assert all(parameter.grad.any() for parameter in critics.q1.parameters())
+    assert not any(parameter.grad.any() for parameter in critics.q2.parameters())
+
+
+def test_observation_scaling():
+    scaling = ObservationScaling(3)
+    observations = torch.tensor([[1.0, 10.0, 7.0], [3.0, 30.0, 7.0]])
+    far = torch.tensor([[1e6, -1e6, 0.0]])
+    assert torch.equal(scaling(observations), observations) and torch.equal(scaling(far), far)
+    scaling.fit(observations, common.Ranks())
+    assert scaling(observations).tolist() == [[-1, -1, 0], [1, 1, 0]]
+    limit = scaling.limit.item()
+    assert 3 < limit < 100 and scaling(far).tolist() == [[limit, -limit, -limit]]
+    # The third never moved; its spread counts as 0.01.
+    near = scaling(torch.tensor([[2.0, 20.0, 7.02]]))
+    torch.testing.assert_close(near, torch.tensor([[0.0, 0.0, 2.0]]), atol=1e-3, rtol=0)
+    other = ObservationScaling(3)
+    other.load_state_dict(scaling.state_dict())
+    assert torch.equal(other(far), scaling(far))
+
+
+def test_policy_acts_with_the_mean_in_the_tasks_units():
+    action_space = gym.spaces.Box(np.float32([[0, -3], [-1, 5]]), np.float32([[10, 1], [1, 6]]))
+    scaling, actor = ObservationScaling(6), Actor(6, 4, (16,))
+    scaling.fit(torch.randn(100, 6), common.Ranks())
+    policy = Policy(scaling, actor, action_space)
+    observations = torch.randn(5, 2, 3)
+    actions = policy(observations)
+    mean, _ = actor(scaling(observations.flatten(1)))
+    squashed = mean.tanh().view(5, 2, 2)
+    expected = torch.tensor([[5.0, -1.0], [0.0, 5.5]]) + torch.tensor([[5.0, 2.0], [1.0, 0.5]]) * squashed
+    torch.testing.assert_close(actions, expected)
+    # It is what the training environment does with the agent's actions.
+    rescale = gym.wrappers.RescaleAction(StepCounter(action_space), np.float32(-1), np.float32(1))
+    for action, own in zip(actions, squashed):
+        np.testing.assert_allclose(rescale.action(own.detach().numpy()), action.detach().numpy(), rtol=1e-5, atol=1e-6)
+    with torch.no_grad():
+        actor.net[-1].bias[:4] = 100
+    assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
+
+
+# The replay buffer
+
+
+def transitions(first, count):
+    """Numbered transitions (2 observations, 1 action) in which every number tells where it belongs."""
+    n = np.arange(first, first + count, dtype=np.float32)
+    return np.stack((n, n + 0.1), 1), n[:, None] + 0.2, n + 0.3, n % 2 == 1, np.stack((n + 0.4, n + 0.5), 1)
+
+
+def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
+    torch.manual_seed(0)
+    buffer = ReplayBuffer(5, 2, 1, torch.device("cpu"))
+    buffer.rows.fill_(torch.nan)
+    buffer.add(*transitions(0, 3))
+    observations, actions, rewards, terminated, next_observations = buffer.sample(200)
+    n = observations[:, 0]
+    assert set(n.tolist()) == {0, 1, 2}
+    assert observations.shape == next_observations.shape == (200, 2) and actions.shape == (200, 1)
+    assert rewards.shape == terminated.shape == (200,)
+    torch.testing.assert_close(observations[:, 1], n + 0.1)
+    torch.testing.assert_close(actions[:, 0], n + 0.2)
+    torch.testing.assert_close(rewards, n + 0.3)
+    assert torch.equal(terminated, n % 2)
+    torch.testing.assert_close(next_observations, torch.stack((n + 0.4, n + 0.5), 1))
+
+    buffer.add(*transitions(3, 4))  # across the end
+    assert buffer.size == 5 and buffer.position == 2
+    counts = buffer.sample(5000)[0][:, 0].long().bincount()
+    assert counts[:2].tolist() == [0, 0] and counts[2:].min() > 850 and len(counts) == 7
+    observations, rewards = buffer.observations_and_rewards()
+    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and rewards.shape == (5,)
+
+
+@pytest.mark.parametrize("stored", [3, 7])
+def test_replay_buffer_goes_on_from_its_state(stored):
+    buffer, other = (ReplayBuffer(5, 2, 1, torch.device("cpu")) for _ in range(2))
+    buffer.add(*transitions(0, stored))
+    state = buffer.state()
+    other.load_state(state)
+    for each in (buffer, other):
+        each.add(*transitions(stored, 3))
+    assert torch.equal(other.rows, buffer.rows)
+    assert (other.size, other.position) == (buffer.size, buffer.position) == (5, (stored + 3) % 5)
+    assert len(state["rows"]) == min(stored, 5)  # a copy: what was added later is not in it
+    assert state["rows"].max() < stored
+
+
+# The agent
+
+
+def test_update_is_one_step_of_each_gradient():
+    """Against separate gradients and Adam's first step by hand: −lr · g / (|g| + ε)."""
+    agent = make_agent(adam_epsilon=1e-2, critic_learning_rate=1e-3, actor_learning_rate=2e-3, alpha_learning_rate=3e-3)
+    config, batch = agent.config, make_batch()
+    agent.fit_scaling(5 * batch[0] + 1, 3 * batch[2])
+    observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
+    actions, rewards, terminated = batch[1], agent.reward_scale * batch[2], batch[3]
+    alpha = agent.log_alpha.exp().item()
+    with torch.no_grad():
+        for parameter in agent.target_critics.parameters():  # else they would equal the critics
+            parameter += 0.05 * torch.randn_like(parameter)
+    actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
+
+    def adam_step(parameters, gradients, learning_rate):
+        with torch.no_grad():
+            for parameter, gradient in zip(parameters, gradients):
+                parameter -= learning_rate * gradient / (gradient.abs() + config.adam_epsilon)
+
+    torch.manual_seed(5)
+    metrics = agent.update(batch)
+
+    torch.manual_seed(5)
+    with torch.no_grad():
+        next_actions, next_log_probs = actor.sample(next_observations)
+        next_value = target_critics(next_observations, next_actions).min(0).values - alpha * next_log_probs
+        targets = torch.where(terminated == 1, rewards, rewards + config.gamma * next_value)
+    q = critics(observations, actions)
+    loss = 0.5 * ((q[0] - targets) ** 2).mean() + 0.5 * ((q[1] - targets) ** 2).mean()
+    critic_gradients = torch.autograd.grad(loss, list(critics.parameters()))
+    adam_step(critics.parameters(), critic_gradients, config.critic_learning_rate)
+    assert metrics["critic_loss"].item() == pytest.approx(loss.item(), rel=1e-5)
+    # The critics moved by their own loss alone: the actor's left them neither a gradient nor a step.
+    for own, expected, gradient in zip(agent.critics.parameters(), critics.parameters(), critic_gradients):
+        torch.testing.assert_close(own, expected, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(own.grad, gradient, rtol=1e-4, atol=1e-6)
+
+    new_actions, log_probs = actor.sample(observations)  # the actor learns from the critics that have just moved
+    loss = (alpha * log_probs - critics(observations, new_actions).min(0).values).mean()
+    gradients = torch.autograd.grad(loss, list(actor.parameters()))
+    adam_step(actor.parameters(), gradients, config.actor_learning_rate)
+    assert metrics["actor_loss"].item() == pytest.approx(loss.item(), rel=1e-4)
+    assert metrics["entropy"].item() == pytest.approx(-log_probs.mean().item(), rel=1e-4)
+    for own, expected in zip(agent.actor.parameters(), actor.parameters()):
+        torch.testing.assert_close(own, expected, rtol=1e-5, atol=1e-6)
+
+    gradient = -(log_probs.mean() + agent.target_entropy).item()
+    step = -config.alpha_learning_rate * gradient / (abs(gradient) + config.adam_epsilon)
+    assert agent.log_alpha.item() == pytest.approx(config.initial_log_alpha + step, abs=1e-6)
+    assert metrics["alpha"].item() == pytest.approx(alpha)
+
+    moved = zip(agent.target_critics.parameters(), target_critics.parameters(), agent.critics.parameters())
+    for own, before, critic in moved:
+        torch.testing.assert_close(own, before + config.target_update_tau * (critic - before), rtol=0, atol=1e-7)
+        assert not torch.equal(own, before) and own.grad is None
+
+
+def test_update_learns_from_terminated_and_truncated_differently():
+    batch = make_batch()
+    losses = []
+    for terminated in (torch.zeros(32), torch.ones(32)):
+        torch.manual_seed(0)
+        agent = make_agent(initial_log_alpha=0.0, reward_scale_factor=1.0)
+        losses.append(agent.update((*batch[:3], terminated, batch[4]))["critic_loss"].item())
+    q = make_agent().critics(*batch[:2])
+    assert losses[1] == pytest.approx(0.5 * (q - batch[2]).square().mean(1).sum().item(), rel=1e-5)
+    assert abs(losses[0] - losses[1]) > 0.01
+
+
+@pytest.mark.parametrize("target_entropy, direction", [(10.0, 1), (-10.0, -1)])
+def test_alpha_moves_towards_the_target_entropy(target_entropy, direction):
+    agent = make_agent(target_entropy_per_action=target_entropy)
+    before = agent.log_alpha.item()
+    for _ in range(3):
+        agent.update(make_batch())
+    moved = agent.log_alpha.item() - before
+    assert direction * moved == pytest.approx(3 * agent.config.alpha_learning_rate, rel=0.01)
+
+
+def test_fit_scaling():
+    agent = make_agent(reward_scale_factor=6.0)
+    observations = torch.tensor([[1.0, 10.0, 7.0], [3.0, 30.0, 7.0]])
+    agent.fit_scaling(observations, torch.tensor([-1.0, 5.0]))
+    assert agent.reward_scale.item() == pytest.approx(6 / 3)
+    assert agent.scaling.mean.tolist() == [2, 20, 7]
+    assert agent.policy.scaling is agent.scaling  # so it is evaluated and exported with the policy
+
+
+@pytest.mark.parametrize("reward", [0.0, 0.1, 1.0])
+def test_rewards_that_are_all_equal_keep_their_scale(reward):
+    agent = make_agent(reward_scale_factor=2.0)
+    agent.fit_scaling(torch.randn(1000, 3), torch.full((1000,), reward))
+    assert agent.reward_scale.item() == 2.0
+
+
+def test_the_tutorials_values_are_the_defaults():
+    config = Config()
+    assert config.env_id == "MinitaurBulletEnv-v0" and config.num_iterations == 100_000
+    assert config.initial_collect_steps == 10_000 and config.collect_steps_per_iteration == 1
+    assert config.batch_size == 256 and config.gamma == 0.99 and config.critic_loss_weight == 0.5
+    assert config.actor_learning_rate == config.critic_learning_rate == config.alpha_learning_rate == 3e-4
+    assert config.actor_layers == config.critic_layers == (256, 256)
+    assert (config.log_interval, config.eval_interval, config.num_eval_episodes) == (5_000, 10_000, 20)
+    assert config.checkpoint_interval == 5_000
+
+
+def test_the_tutorials_exact_choices_are_flags():
+    flags = """--no-observation-scaling --no-reward-scaling --no-critic-layer-norm --initial-log-alpha 0
+        --target-entropy-per-action -0.5 --target-update-tau 0.005 --reward-scale-factor 1
+        --replay-buffer-capacity 10000"""
+    assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
+    agent = make_agent(**TUTORIALS)
+    observations = 100 * torch.randn(50, 3)
+    agent.fit_scaling(observations, 7 * torch.randn(50))
+    assert torch.equal(agent.scaling(observations), observations)
+    assert agent.reward_scale == 1 and agent.log_alpha.exp() == 1 and agent.target_entropy == -2 / 2
+    assert not any(isinstance(module, nn.LayerNorm) for module in agent.critics.modules())
+    assert any(isinstance(module, nn.LayerNorm) for module in make_agent().critics.modules())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch):
+    generator = torch.Generator().manual_seed(3)
+    noise = [torch.randn(32, 2, generator=generator) for _ in range(2)]
+    agents = [make_agent(device=device, adam_epsilon=1e-2) for device in ("cpu", "cuda")]
+    agents[1].load_state(agents[0].state())  # each device has a generator of its own
+    results = []
+    for agent in agents:
+        draws = iter(noise)
+        monkeypatch.setattr(torch, "randn_like", lambda mean: next(draws).to(mean.device))
+        batch = tuple(tensor.to(agent.device) for tensor in make_batch())
+        agent.fit_scaling(batch[0], batch[2])
+        metrics = agent.update(batch)
+        state = agent.state()
+        results.append({name: value.cpu() for name, value in metrics.items()})
+        results[-1] |= {
+            f"{name}.{key}": value.cpu()
+            for name in ("actor", "critics", "target_critics")
+            for key, value in state[name].items()
+        }
+    torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)
+
+
+# Training
+
+
+class StepCounter(gym.Env):
+    """Its observation says which episode and step it is. At step 4 it terminates, or leaves that to a time limit."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+
+    def __init__(self, action_space=None, terminates=False):
+        self.action_space = action_space or gym.spaces.Box(-1, 1, (1,))
+        self.terminates, self.episode = terminates, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episode, self.step_number = self.episode + 1, 0
+        return np.float32([self.episode, 0]), {}
+
+    def step(self, action):
+        self.step_number += 1
+        observation = np.float32([self.episode, self.step_number])
+        return observation, float(self.step_number), self.terminates and self.step_number == 4, False, {}
+
+
+# Named with the module, so that worker processes that are not forked find them too.
+gym.register("Truncated-v0", entry_point=StepCounter, max_episode_steps=4)
+gym.register("Terminated-v0", entry_point=StepCounter, kwargs={"terminates": True})
+
+TINY = dict(
+    env_id="Pendulum-v1",
+    device="cpu",
+    num_iterations=60,
+    initial_collect_steps=250,
+    batch_size=32,
+    replay_buffer_capacity=1000,
+    actor_layers=(16, 16),
+    critic_layers=(16, 16),
+    log_interval=20,
+    eval_interval=30,
+    checkpoint_interval=25,
+    num_eval_episodes=2,
+    video=False,
+)
+
+
+def train(path, **choices):
+    """A tiny run. Returns its directory and the agent's calls, in order: fit_scaling with its data, and update."""
+    calls = []
+
+    def recorded(name):
+        method = getattr(SACAgent, name)
+
+        def call(self, *arguments):
+            calls.append((name, arguments))
+            return method(self, *arguments)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("update", "fit_scaling"):
+            patch.setattr(SACAgent, name, recorded(name))
+        returned = sac_minitaur.train(Config(**TINY | {"run_dir": str(path)} | choices))
+    assert returned == path
+    return path, calls
+
+
+def read_csv(path):
+    with open(path) as file:
+        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def read_checkpoint(path):
+    state = torch.load(path / "checkpoint.pt", weights_only=True)
+    return state["shared"], state["ranks"][0]
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory):
+    return train(tmp_path_factory.mktemp("runs") / "tiny")
+
+
+def test_train_does_what_the_config_says(tiny_run):
+    path, calls = tiny_run
+    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"]
+    observations, rewards = calls[0][1]
+    assert observations.shape == (250, 3) and rewards.shape == (250,)
+    assert all(batch[0].shape == (32, 3) for _, (batch,) in calls[1:])
+    shared, own = read_checkpoint(path)
+    assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) == 250 + 60
+    assert json.loads((path / "config.json").read_text())["num_iterations"] == 60
+    files = {"config.json", "train.csv", "eval.csv", "random.csv", "learning_curve.png", "checkpoint.pt", "policy.pt2"}
+    assert files | {"best_policy.pt2"} <= {file.name for file in path.iterdir()}
+    assert list(path.glob("events.out.tfevents.*"))
+    assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_train_writes_its_rows(tiny_run):
+    path, _ = tiny_run
+    evaluation = {"step", "env_steps", "seconds", "average_return", "std_return", "average_episode_length"}
+    rows = read_csv(path / "random.csv")
+    assert [(row["step"], row["env_steps"]) for row in rows] == [(0, 0)] and evaluation <= set(rows[0])
+    rows = read_csv(path / "eval.csv")
+    assert [(row["step"], row["env_steps"]) for row in rows] == [(0, 250), (30, 280), (60, 310)]
+    assert evaluation <= set(rows[0]) and all(row["average_episode_length"] == 200 for row in rows)
+    assert all(-2000 < row["min_return"] <= row["average_return"] <= row["max_return"] < 0 for row in rows)
+    rows = read_csv(path / "train.csv")
+    assert [(row["step"], row["env_steps"]) for row in rows] == [(20, 270), (40, 290), (60, 310)]
+    metrics = {"critic_loss", "actor_loss", "alpha_loss", "alpha", "entropy", "mean_q"}
+    assert metrics | {"seconds", "steps_per_second", "collect_return", "collect_episode_length"} <= set(rows[0])
+    assert all(math.isfinite(value) for row in rows for value in row.values())
+    assert rows[-1]["collect_episode_length"] == 200  # the one episode that ended is the random one
+
+
+def test_train_moves_every_parameter(tiny_run):
+    path, _ = tiny_run
+    config = Config(**TINY)
+    torch.manual_seed(config.seed)
+    with gym.make("Pendulum-v1") as env:
+        spaces = env.observation_space, env.action_space
+    untrained = SACAgent(config, *spaces, torch.device("cpu"), common.Ranks()).state()
+    trained = read_checkpoint(path)[0]["agent"]
+    for name in ("actor", "critics", "target_critics", "scaling"):
+        assert trained[name].keys() == untrained[name].keys()
+        for key, value in trained[name].items():
+            assert not torch.equal(value, untrained[name][key]) and value.isfinite().all(), (name, key)
+    # 60 steps of Adam, each of about the learning rate.
+    assert 0 < abs(trained["log_alpha"].item() - config.initial_log_alpha) <= 60 * config.alpha_learning_rate * 1.1
+
+
+def comparable(path):
+    """All that a run leaves and that does not tell the time."""
+    shared, own = read_checkpoint(path)
+    clock = ("seconds", "steps_per_second")
+    tables = {name: read_csv(path / f"{name}.csv") for name in ("train", "eval", "random")}
+    for row in sum(tables.values(), []):
+        for name in clock:
+            row.pop(name, None)
+    return shared["agent"], own, tables
+
+
+def same(a, b):
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
+    path, _ = tiny_run
+    again, _ = train(tmp_path / "again")
+    for a, b in zip(comparable(path), comparable(again)):
+        assert same(a, b)
+    other, _ = train(tmp_path / "other", seed=1)
+    agent, own, tables = comparable(other)
+    assert not same(agent["actor"], comparable(path)[0]["actor"])
+    assert not same(own["buffer"], comparable(path)[1]["buffer"])
+    assert tables["eval"][0]["average_return"] != comparable(path)[2]["eval"][0]["average_return"]
+
+
+def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
+    path, calls = train(tmp_path / "run", num_envs=3)
+    # 250 is no multiple of 3. The scaling is fitted before the first update all the same, on all there is.
+    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252
+    assert all(row["env_steps"] - 250 - row["step"] in range(6) for row in read_csv(path / "train.csv"))
+    shared, own = read_checkpoint(path)
+    assert shared["env_steps"] == len(own["buffer"]["rows"]) == 312
+    starts = own["buffer"]["rows"][:3, :3]
+    assert len(starts.unique(dim=0)) == 3  # each environment has episodes of its own
+
+
+def test_several_steps_per_update_and_a_small_buffer(tmp_path):
+    path, calls = train(tmp_path / "run", collect_steps_per_iteration=3, num_iterations=20, replay_buffer_capacity=100)
+    shared, own = read_checkpoint(path)
+    assert [name for name, _ in calls] == ["fit_scaling"] + 20 * ["update"]
+    assert shared["env_steps"] == 250 + 3 * 20 and len(own["buffer"]["rows"]) == 100
+
+
+@pytest.mark.parametrize("env_id, num_envs", [("Truncated-v0", 2), ("Terminated-v0", 1)])
+def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
+    path, _ = train(tmp_path / "run", env_id=f"{__name__}:{env_id}", num_envs=num_envs, initial_collect_steps=40)
+    rows = read_checkpoint(path)[1]["buffer"]["rows"]
+    observations, actions, rewards, terminated, next_observations = rows.split((2, 1, 1, 1, 2), dim=1)
+    # Within an episode to its very end, never the first observation of the next.
+    assert torch.equal(next_observations, observations + torch.tensor([0.0, 1.0]))
+    assert observations[:, 1].unique().tolist() == [0, 1, 2, 3]
+    assert torch.equal(rewards, next_observations[:, 1:])  # unscaled, as the environment gave them
+    ended = next_observations[:, 1:] == 4
+    assert torch.equal(terminated, (ended if env_id == "Terminated-v0" else torch.zeros_like(ended)).float())
+    assert actions.abs().max() <= 1 and len(actions[:40].unique()) == 40
+    # Every environment's episodes follow each other.
+    for i in range(num_envs):
+        count = torch.arange(len(rows[i::num_envs]))
+        assert torch.equal(observations[i::num_envs], torch.stack((1 + count // 4, count % 4), 1).float())
+
+
+# Exported policies
+
+
+def test_exported_policy_runs_without_this_project(tiny_run, tmp_path):
+    path, _ = tiny_run
+    batches = [torch.randn(size, 3) * torch.tensor([1.0, 1.0, 8.0]) for size in (1, 2, 7)]
+    torch.save(batches, tmp_path / "batches.pt")
+    code = """
+import sys, torch
+policy = torch.export.load(sys.argv[1]).module()
+torch.save([policy(batch) for batch in torch.load("batches.pt")], "actions.pt")
+assert not {"sac_minitaur", "common", "gymnasium"} & set(sys.modules)
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    command = [sys.executable, "-c", code, str(path / "policy.pt2")]
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+
+    saved = read_checkpoint(path)[0]["agent"]
+    with gym.make("Pendulum-v1") as env:
+        policy = Policy(ObservationScaling(3), Actor(3, 1, TINY["actor_layers"]), env.action_space)
+    policy.actor.load_state_dict(saved["actor"])
+    policy.scaling.load_state_dict(saved["scaling"])
+    for batch, actions in zip(batches, torch.load(tmp_path / "actions.pt")):
+        assert actions.shape == (len(batch), 1)
+        torch.testing.assert_close(actions, policy(batch).detach(), rtol=1e-6, atol=1e-6)
+    assert actions.unique().numel() == 7 and actions.abs().max() <= 2
+
+
+def main(monkeypatch, *arguments):
+    """The command line within this process. Returns the exit status."""
+    monkeypatch.setattr(sys, "argv", ["sac_minitaur.py", *map(str, arguments)])
+    try:
+        common.run_main(sac_minitaur.main)
+    except SystemExit as exit_:
+        return exit_.code
+    return 0
+
+
+def test_evaluates_the_best_policy(tiny_run, monkeypatch, capsys):
+    path, _ = tiny_run
+    file = path / "best_policy.pt2"
+    arguments = ("--evaluate", file, "--env-id", "Pendulum-v1", "--num-eval-episodes", 2, "--no-video")
+    assert main(monkeypatch, *arguments) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith(f"{file}: AverageReturn = ") and "AverageEpisodeLength = 200.0" in line
+    best = max(row["average_return"] for row in read_csv(path / "eval.csv"))
+    assert float(line.split(" = ")[1].split()[0]) == pytest.approx(best, rel=1e-3)
+
+
+# Learning
+
+
+def test_learns_pendulum(tmp_path):
+    path, _ = train(
+        tmp_path / "run",
+        num_iterations=3000,
+        initial_collect_steps=1000,
+        batch_size=128,
+        replay_buffer_capacity=10_000,
+        actor_layers=(64, 64),
+        critic_layers=(64, 64),
+        log_interval=1000,
+        eval_interval=3000,
+        checkpoint_interval=3000,
+        num_eval_episodes=10,
+    )
+    random_return = read_csv(path / "random.csv")[0]["average_return"]
+    rows = read_csv(path / "eval.csv")
+    assert [row["step"] for row in rows] == [0, 3000]
+    assert random_return < -700 and rows[0]["average_return"] < -700
+    assert rows[1]["average_return"] > -400  # a pendulum kept upright from the first swing on has about −150
+
+
+# What the user can get wrong
+
+
+def assert_one_line(status, stderr):
+    lines = stderr.splitlines()
+    assert status == 2 and len(lines) == 1 and lines[0].startswith("error: "), stderr
+
+
+@pytest.mark.parametrize(
+    "arguments, named",
+    [
+        ("--env-id NoSuchTask-v0", "NoSuchTask"),
+        ("--env-id no_such_module:Task-v0", "no_such_module"),
+        ("--env-id CartPole-v1", "Discrete"),
+        ("--device tpu", "tpu"),
+        ("--device cuda:77", "cuda:77"),
+        ("--batch-size 300", "--batch-size 300"),
+        ("--batch-size 0", "--batch-size"),
+        ("--num-iterations -5", "--num-iterations"),
+        ("--initial-collect-steps 0", "--initial-collect-steps"),
+        ("--collect-steps-per-iteration 0", "--collect-steps-per-iteration"),
+        ("--num-envs 0", "--num-envs"),
+        ("--replay-buffer-capacity -1", "--replay-buffer-capacity"),
+        ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
+        ("--num-threads 0", "--num-threads"),
+        ("--log-interval 0", "--log-interval"),
+        ("--eval-interval -1", "--eval-interval"),
+        ("--num-eval-episodes 0", "--num-eval-episodes"),
+        ("--checkpoint-interval 0", "--checkpoint-interval"),
+        ("--resume nowhere", "nowhere"),
+        ("--evaluate nowhere.pt2", "nowhere.pt2"),
+        ("--evaluate full/file", "full/file"),
+        ("--run-dir full", "not empty"),
+        ("--run-dir full/file", "full/file"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("somebody's work")
+    flag, value = arguments.split()
+    flags = {"--env-id": "Pendulum-v1", "--device": "cpu", "--initial-collect-steps": 250, "--batch-size": 32}
+    flags |= {"--num-iterations": 1, "--run-dir": "run", flag: value}
+    status = main(monkeypatch, *(word for pair in flags.items() for word in pair))
+    output = capfd.readouterr()
+    assert_one_line(status, output.err)
+    assert named in output.err and output.out == ""
+    assert (tmp_path / "full" / "file").read_text() == "somebody's work"
+
+
+@pytest.mark.parametrize("arguments", ["--env-id NoSuchTask-v0", "--env-id Pendulum-v1 --device cuda:77"])
+def test_bad_input_as_the_shell_sees_it(arguments, tmp_path):
+    command = [sys.executable, str(ROOT / "sac_minitaur.py"), *arguments.split()]
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert_one_line(process.returncode, process.stderr)
+
+
+def test_a_malformed_value_is_refused(monkeypatch, capfd):
+    assert main(monkeypatch, "--batch-size", "x") == 2
+    assert "--batch-size" in capfd.readouterr().err
