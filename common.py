@@ -464,6 +464,7 @@ class Run:
                 self._make_directory()
         self.tables = self.checkpoint.get("tables", {})
         self.best_return = self.checkpoint.get("best_return", -math.inf)
+        self.best_weights = self.checkpoint.get("best_weights")
         self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
         self.session = (time.monotonic(), self.checkpoint.get("step", 0))
         self.summary_writer = None
@@ -536,7 +537,8 @@ class Run:
         """Says what is trained, on what, and where it is written."""
         config = self.config
         processes = f", process 0 of {self.ranks.world_size}" if self.ranks.world_size > 1 else ""
-        self.print(f"task {config.env_id}: observations {observation_space}, actions {action_space}")
+        with np.printoptions(precision=2, threshold=8, edgeitems=2):
+            self.print(f"task {config.env_id}: observations {observation_space}, actions {action_space}")
         self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
         self.print(f"replay buffer of {buffer_bytes / 1e6:.0f} MB when full; run directory {self.path}")
 
@@ -585,9 +587,15 @@ class Run:
         """Evaluates `policy` (None: random actions) beside training, to be reported under this step."""
         self.evaluations.start(self.header(step, env_steps), policy)
 
-    def restart_evaluations(self, policy):
-        """Starts the evaluations again that were under way at the checkpoint; `policy` is lent for their weights."""
+    def restart_evaluations(self, policy, policy_file):
+        """Starts the evaluations again that were under way at the checkpoint; `policy` is lent for their weights.
+
+        The best policy is written again too: the file's may be of an evaluation that came after the checkpoint.
+        """
         policy = copy_to_cpu(policy)
+        if self.best_weights is not None and self.writes:
+            policy.load_state_dict(self.best_weights)
+            policy_file.save(self.path / "best_policy.pt2", policy)
         for header, weights in self.checkpoint["evaluations"]:
             if weights is not None:
                 policy.load_state_dict(weights)
@@ -615,7 +623,7 @@ class Run:
             if policy:
                 self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             if policy and row["average_return"] > self.best_return:
-                self.best_return = row["average_return"]
+                self.best_return, self.best_weights = row["average_return"], policy.state_dict()
                 policy_file.save(self.path / "best_policy.pt2", policy)
 
     def stop_requested(self):
@@ -666,6 +674,7 @@ class Run:
             "config": dataclasses.asdict(self.config),
             "tables": self.tables,
             "best_return": self.best_return,
+            "best_weights": self.best_weights,
             "seconds": time.monotonic() - self.started,
             "evaluations": self.evaluations.state(),
         }
@@ -737,7 +746,7 @@ def resumed_config(config, parse):
         saved = type(config)(**{key: tuple(v) if isinstance(v, list) else v for key, v in saved.items()})
         for field in dataclasses.fields(saved):
             value = getattr(saved, field.name)
-            if not isinstance(value, tuple) and not isinstance(value, field.type):
+            if not isinstance(value, tuple | field.type) and not (field.type is float and isinstance(value, int)):
                 raise TypeError(f"{field.name} is {value!r}")
     except FileNotFoundError:
         raise InputError(f"--resume {config.resume}: there is no run there (no {path.name})") from None

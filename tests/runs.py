@@ -131,18 +131,9 @@ def rows(path):
 
 
 def checkpoint(run_dir):
-    """What a checkpoint holds, without times and paths."""
     import torch
 
-    state = torch.load(run_dir / "checkpoint.pt", weights_only=True)
-    shared = state["shared"]
-    del shared["seconds"]
-    for name in ("run_dir", "resume", "video", "checkpoint_interval"):
-        del shared["config"][name]
-    for row in [row for table in shared["tables"].values() for row in table] + [row for row, _ in shared["evaluations"]]:
-        row.pop("seconds")
-        row.pop("steps_per_second", None)
-    return state
+    return torch.load(run_dir / "checkpoint.pt", weights_only=True)
 
 
 def assert_same(a, b, where="checkpoint"):
