@@ -352,7 +352,7 @@ def train(config):
             agent.load_state(saved["agent"])
             buffer.load_state(saved["buffer"])
             common.set_random_state(saved["random"])
-            run.restart_evaluations(agent.policy)
+            run.restart_evaluations(agent.policy, policy_file)
         else:
             run.start_evaluation(step, env_steps, policy=None)
             run.start_evaluation(step, env_steps, agent.policy)
