@@ -449,6 +449,8 @@ class Run:
         self.writes = self.ranks.rank == 0
         if config.batch_size % self.ranks.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.ranks.world_size} processes")
+        if self.ranks.world_size > 1 and ":" in config.device:
+            raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
         if config.resume:
             self.path = Path(config.resume)
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)

@@ -221,6 +221,23 @@ def test_learns_values_of_a_known_chain():
         assert agent.q_network(torch.ones(4)).tolist() == pytest.approx([value, value], abs=0.02)
 
 
+def test_offset_is_added_to_both_networks():
+    """The offset is the mean reward for ever, and enters q, and the targets where the episode goes on."""
+    torch.manual_seed(0)
+    agent = make_agent(gamma=0.9)
+    agent.fit_offset(torch.tensor([1.0, 3.0]))
+    assert agent.value_offset.item() == pytest.approx(2 / (1 - 0.9))
+    for parameter in [*agent.parameters, *agent.target_parameters]:
+        parameter.data.zero_()
+    observations, actions = torch.zeros(2, 4), torch.tensor([0, 1])
+    metrics = agent.update((observations, actions, torch.ones(2), torch.tensor([0.0, 1.0]), observations))
+    assert metrics["mean_q"].item() == pytest.approx(20)
+    assert metrics["loss"].item() == pytest.approx(((1 + 0.9 * 20 - 20) ** 2 + (1 - 20) ** 2) / 2)
+    without = make_agent(value_offset=False)
+    without.fit_offset(torch.ones(2))
+    assert without.value_offset == 0
+
+
 def test_policy_is_greedy():
     torch.manual_seed(0)
     agent = make_agent()
@@ -362,6 +379,7 @@ def test_imports_without_pybullet():
         ("--num-iterations 0", "num-iterations"),
         ("--num-iterations -5", "num-iterations"),
         ("--num-envs 0", "num-envs"),
+        ("--gamma 1", "value-offset"),
         ("--run-dir .", "not empty"),
         ("--resume nowhere", "nowhere"),
         ("--evaluate nowhere.pt2", "nowhere.pt2"),
