@@ -8,6 +8,7 @@ drift of the machine's speed touches all alike. Quote the ratios rather than the
 """
 
 import importlib.util
+import os
 import platform
 import statistics
 import subprocess
@@ -26,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 import common  # noqa: E402
 import sac_minitaur  # noqa: E402
 
-REPEATS = 5
+REPEATS = 3
 TRAINING_STEPS = 1_000
 
 
@@ -49,9 +50,9 @@ def environment_candidates():
     action = np.zeros(8, np.float32)  # stands, so that step after step has the same contacts
     for _ in range(100):
         env.step(action)
-    yield "environment step", lambda: milliseconds(lambda: env.step(action), 200)
     bare = env.simulator.stepSimulation
     yield "five bare stepSimulation calls", lambda: milliseconds(lambda: [bare() for _ in range(5)], 200)
+    yield "step", lambda: milliseconds(lambda: env.step(action), 200)
 
 
 def new_agent_and_buffer(num_threads):
@@ -72,8 +73,8 @@ def update_candidates():
         torch.set_num_threads(num_threads)
         return milliseconds(lambda: agent.update(buffer.sample(256)), 100)
 
-    yield "update, 1 thread", lambda: update(1)
-    yield "update, 2 threads", lambda: update(2)
+    yield "1 thread", lambda: update(1)
+    yield "2 threads", lambda: update(2)
 
 
 def run(*command):
@@ -83,42 +84,51 @@ def run(*command):
     return (time.perf_counter() - start) * 1e3
 
 
-def training(num_iterations, *flags):
-    """Milliseconds an iteration: a long run less a short one, so that start-up and initial collection cancel."""
+def training(evaluations, *flags):
+    """Milliseconds an iteration: a long run less a short one, so that start-up and initial collection cancel.
+
+    With `evaluations` there are 2 episodes for every 1 000 iterations, which is the default command's 20 for 10 000.
+    """
     times = []
-    for iterations in (num_iterations + 100, 100):
+    for iterations in (100 + TRAINING_STEPS, 100):
         with tempfile.TemporaryDirectory() as directory:
             times.append(
                 run(
                     "sac_minitaur.py", "--num-iterations", iterations, "--initial-collect-steps", 500, "--no-video",
-                    "--num-eval-episodes", 1, "--eval-interval", 1_000_000, "--run-dir", Path(directory) / "run", *flags,
+                    "--eval-interval", 1_000 if evaluations else 1_000_000, "--num-eval-episodes", 2 if evaluations else 1,
+                    "--run-dir", Path(directory) / "run", *flags,
                 )  # fmt: skip
             )
-    return (times[0] - times[1]) / num_iterations
+    return (times[0] - times[1]) / TRAINING_STEPS
 
 
-def peer_training(module, num_iterations):
+def peer_training(module, evaluations):
     """The same of `SAC` of stable_baselines3 or sbx, with the tutorials' sizes, in a process of its own."""
     code = f"""
 import time, torch, sac_minitaur, gymnasium as gym
 from {module} import SAC
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
 torch.set_num_threads(2)
-model = SAC("MlpPolicy", gym.make("MinitaurBulletEnv-v0"), learning_starts=500, batch_size=256, buffer_size=100_000)
+env, eval_env = gym.make("MinitaurBulletEnv-v0"), Monitor(gym.make("MinitaurBulletEnv-v0"))
+callback = EvalCallback(eval_env, n_eval_episodes=2, eval_freq=1000, verbose=0) if {evaluations} else None
+model = SAC("MlpPolicy", env, learning_starts=500, batch_size=256, buffer_size=100_000)
 model.learn(600)
 start = time.perf_counter()
-model.learn({num_iterations}, reset_num_timesteps=False)
-print((time.perf_counter() - start) / {num_iterations} * 1e3)
+model.learn({TRAINING_STEPS}, reset_num_timesteps=False, callback=callback)
+print((time.perf_counter() - start) / {TRAINING_STEPS} * 1e3)
 """
     out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     return float(out.splitlines()[-1])
 
 
-def training_candidates():
-    yield "training, 1 thread", lambda: training(TRAINING_STEPS)
-    yield "training, 2 threads", lambda: training(TRAINING_STEPS, "--num-threads", 2)
+def training_candidates(evaluations):
+    """Ours on one and two threads, and the peers that are installed."""
+    yield "ours, 1 thread", lambda: training(evaluations)
+    yield "ours, 2 threads", lambda: training(evaluations, "--num-threads", 2)
     for name, module in (("Stable-Baselines3", "stable_baselines3"), ("SBX", "sbx")):
         if importlib.util.find_spec(module):
-            yield f"training, {name}", lambda module=module: peer_training(module, TRAINING_STEPS)
+            yield f"{name}, 2 threads", lambda module=module: peer_training(module, evaluations)
 
 
 def dqn():
@@ -128,16 +138,19 @@ def dqn():
 
 def main():
     common.keep_freed_memory()
-    print(f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}")
-    for candidates, base in (
-        (dict(environment_candidates()), "five bare stepSimulation calls"),
-        (dict(update_candidates()), "update, 1 thread"),
-        (dict(training_candidates()), "training, 1 thread"),
-        ({"DQN, the whole default command": dqn}, "DQN, the whole default command"),
+    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {torch.__version__}")
+    for title, candidates in (
+        ("Minitaur, one step", environment_candidates()),
+        ("SAC update, batch 256", update_candidates()),
+        ("SAC training, an iteration without evaluations", training_candidates(evaluations=False)),
+        ("SAC, an iteration of the whole job", training_candidates(evaluations=True)),
+        ("DQN, the whole default command", iter([("ours", dqn)])),
     ):
-        result = medians(candidates)
+        result = medians(dict(candidates))
+        print(f"\n{title}")
+        first = next(iter(result.values()))
         for name, time_ in result.items():
-            print(f"{name:32} {time_:10.2f} ms   × {time_ / result[base]:.2f} of {base}", flush=True)
+            print(f"  {name:32} {time_:10.2f} ms  × {time_ / first:.2f}", flush=True)
 
 
 if __name__ == "__main__":
