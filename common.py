@@ -270,6 +270,7 @@ class Episodes:
         finally:
             for process in envs.processes:
                 process.kill()  # between two steps or within one, there is nothing in a worker to save
+            envs.closed = True
 
     def record(self, actions, rewards, done):
         """Notes one step of every environment: actions (K, …), rewards (K,), done (K,)."""
@@ -568,6 +569,9 @@ class Run:
 
         if self.summary_writer is None:
             self.summary_writer = SummaryWriter(self.path)
+            # Its thread would print what it meets on a full disk, and raises it here at the next row anyway.
+            others = threading.excepthook
+            threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or others(thread)
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])

@@ -1,5 +1,6 @@
 """Damaged and hostile files, full disks, dead workers, losses that are not numbers: one line, and nothing is lost."""
 
+import importlib
 import io
 import json
 import os
@@ -113,8 +114,13 @@ def copy(reference, tmp_path):  # noqa: F811
 
 def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
     whole = (copy / "checkpoint.pt").read_bytes()
-    cases = {name: (damage, "checkpoint.pt") for name, damage in DAMAGES.items()} | FOREIGN
-    for name, (damage, word) in cases.items():
+    for name, damage in DAMAGES.items():
+        (copy / "checkpoint.pt").write_bytes(whole)
+        damage(copy / "checkpoint.pt")
+        with pytest.raises(common.InputError, match="checkpoint.pt") as error:
+            common.load_checkpoint(copy / "checkpoint.pt", script, common.Ranks())
+        assert "\n" not in str(error.value), name
+    for name, (damage, word) in FOREIGN.items():
         (copy / "checkpoint.pt").write_bytes(whole)
         damage(copy / "checkpoint.pt")
         assert_one_line(Process(script, ["--resume", copy], tmp_path / name), 2, word)
@@ -125,9 +131,13 @@ def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
 def test_damaged_config(script, copy, tmp_path):  # noqa: F811
     config = json.loads((copy / "config.json").read_text())
     texts = "", "[1, 2]", json.dumps(config | {"wings": 2}), json.dumps(config | {"num_iterations": "many"})
-    for i, text in enumerate(texts):
+    config_type = importlib.import_module(script).Config
+    for text in texts:
         (copy / "config.json").write_text(text)
-        assert_one_line(Process(script, ["--resume", copy], tmp_path / str(i)), 2, "config.json")
+        with pytest.raises(common.InputError, match="config.json") as error:
+            common.resumed_config(config_type(resume=str(copy)), lambda saved: saved)
+        assert "\n" not in str(error.value)
+    assert_one_line(Process(script, ["--resume", copy], tmp_path / "output"), 2, "config.json")
 
 
 def test_one_script_does_not_continue_the_other(script, reference, tmp_path):  # noqa: F811
