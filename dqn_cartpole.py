@@ -48,7 +48,9 @@ class Config:
     """transitions per update, over all processes"""
 
     learning_rate: float = 1e-3
-    """Adam's"""
+    """Adam's, at the start"""
+    learning_rate_decay: int = 2_000
+    """ours (theirs: none): after this many updates the learning rate is half, after n times as many 1 / (1 + n)"""
     adam_epsilon: float = 1e-7
     """Adam's ε (Keras' default, which the tutorial leaves unsaid)"""
     epsilon: float = 0.1
@@ -59,6 +61,8 @@ class Config:
     """ours (theirs: 1): step of the target network towards the Q-network, after every update"""
     value_offset: bool = True
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
+    value_bound: bool = True
+    """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth for ever"""
     layers: tuple[int, ...] = (100, 50)
     """hidden units of the Q-network"""
 
@@ -169,10 +173,12 @@ class ReplayBuffer:
         self.sizes = (observation_size, 1, 1, 1, observation_size)
         self.rows = torch.empty(capacity, sum(self.sizes), device=device)
         self.size = self.position = 0
+        self.largest_reward = -math.inf
 
     def add(self, observations, actions, rewards, terminated, next_observations):
         """Stores K transitions: (K, O), (K,), (K,), (K,), (K, O), as numpy arrays. Overwrites the oldest when full."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
+        self.largest_reward = max(self.largest_reward, float(rewards.max()))
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
         for row in rows:
             self.rows[self.position].copy_(row)
@@ -191,23 +197,25 @@ class ReplayBuffer:
 
     def state(self):
         """A copy of the filled part, for a checkpoint."""
-        return {"rows": self.rows[: self.size].cpu().clone(), "position": self.position}
+        rows = self.rows[: self.size].cpu().clone()
+        return {"rows": rows, "position": self.position, "largest_reward": self.largest_reward}
 
     def load_state(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
+        self.largest_reward = state["largest_reward"]
         self.rows[: self.size] = state["rows"].to(self.rows.device)
 
 
 # The agent
 
 
-def td_targets(rewards, terminated, next_q, next_actions, gamma):
+def td_targets(rewards, terminated, next_q, next_actions, gamma, bound=math.inf):
     """r + γ (1 − terminated) Q_target(s', a'): (B,), with a' the Q-network's own choice (double DQN, arXiv:1509.06461).
 
-    next_q (B, A) from the target network, the rest (B,).
+    next_q (B, A) from the target network, the rest (B,). No target exceeds `bound`.
     """
     next_value = next_q.gather(1, next_actions[:, None]).squeeze(1)
-    return rewards + gamma * (1 - terminated) * next_value
+    return (rewards + gamma * (1 - terminated) * next_value).clamp(max=bound)
 
 
 def td_loss(q, targets):
@@ -238,6 +246,9 @@ class DQNAgent:
         self.target_parameters = list(self.target_network.parameters())
         adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.optimizer = torch.optim.Adam(self.parameters, config.learning_rate, **adam)
+        # A policy that balances sees only states that are worth the same, and the noise of large steps upsets it again.
+        decay = config.learning_rate_decay
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimizer, lambda updates: 1 / (1 + updates / decay))
 
     def random_actions(self, count):
         """Uniform actions (K,), numpy."""
@@ -256,25 +267,28 @@ class DQNAgent:
         exploring = (torch.rand(len(greedy)) < self.config.epsilon).numpy()
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
-    def update(self, batch):
+    def update(self, batch, largest_reward):
         """One gradient step of the Q-network, then of its target.
 
-        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
+        `batch` is what `ReplayBuffer.sample` returns, `largest_reward` the largest ever stored. Returns the scalars to log, as tensors on the device: reading a
         number back here would make a GPU wait at every step.
         """
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
+        # Where all states are worth the same, errors of extrapolation would add up: the mean Q grew to twice the bound.
+        bound = largest_reward / (1 - config.gamma) if config.value_bound else math.inf
 
         with torch.no_grad():
             next_actions = self.q_network(next_observations).argmax(1)
             next_q = self.value_offset + self.target_network(next_observations)
-            targets = td_targets(rewards, terminated, next_q, next_actions, config.gamma)
+            targets = td_targets(rewards, terminated, next_q, next_actions, config.gamma, bound)
         q = self.value_offset + self.q_network(observations).gather(1, actions[:, None]).squeeze(1)
         loss = td_loss(q, targets)
         self.optimizer.zero_grad()
         loss.backward()
         self.ranks.average_gradients(self.parameters)
         self.optimizer.step()
+        self.schedule.step()
 
         with torch.no_grad():
             torch._foreach_lerp_(self.target_parameters, self.parameters, config.target_update_tau)
@@ -287,6 +301,7 @@ class DQNAgent:
             "target_network": self.target_network.state_dict(),
             "value_offset": self.value_offset,
             "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
         }
 
     def load_state(self, state):
@@ -338,13 +353,13 @@ def check(config):
         config,
         *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
-        "checkpoint_interval",
+        *("checkpoint_interval", "learning_rate_decay"),
     )
     collected = min(config.initial_collect_steps, config.replay_buffer_capacity)
     if config.batch_size > collected:
         raise InputError(f"--batch-size {config.batch_size} is more than the {collected} transitions collected first")
-    if config.value_offset and config.gamma >= 1:
-        raise InputError(f"--gamma {config.gamma} has no endless episode's worth: use --no-value-offset or less than 1")
+    if (config.value_offset or config.value_bound) and config.gamma >= 1:
+        raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1")
 
 
 def train(config):
@@ -410,7 +425,8 @@ def train(config):
             metrics = {}
             updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
             while step < min(updates_due, config.num_iterations):
-                metrics = agent.update(buffer.sample(config.batch_size // ranks.world_size))
+                batch = buffer.sample(config.batch_size // ranks.world_size)
+                metrics = agent.update(batch, buffer.largest_reward)
                 step += 1
                 run.progress.update()
                 if step % config.log_interval == 0:

@@ -70,6 +70,28 @@ def test_targets_by_hand():
     assert targets.tolist() == [1 + 0.5 * 10, 1.0, 2 + 0.5 * 8]
 
 
+def test_targets_do_not_exceed_the_bound():
+    next_q = torch.tensor([[10.0, 0.0], [3.0, 0.0], [3.0, 0.0]])
+    targets = dqn_cartpole.td_targets(torch.ones(3), torch.tensor([0.0, 0, 1]), next_q, torch.zeros(3).long(), 0.5, 4.0)
+    assert targets.tolist() == [4.0, 2.5, 1.0]
+
+
+def test_bound_follows_the_largest_reward():
+    """Rewards of at most 1 bound targets to 1 / (1 − γ), a later reward of 3 to 3 / (1 − γ), also after a reload."""
+    buffer = ReplayBuffer(2, 4, CPU)
+    for reward in (1.0, 3.0, 2.0, 2.0):
+        buffer.add(np.zeros((1, 4)), np.array([0]), np.array([reward]), np.array([False]), np.zeros((1, 4)))
+    copy = ReplayBuffer(2, 4, CPU)
+    copy.load_state(buffer.state())
+    assert copy.largest_reward == buffer.largest_reward == 3.0
+    batch = torch.zeros(1, 4), torch.tensor([0]), torch.tensor([1.0]), torch.tensor([0.0]), torch.zeros(1, 4)
+    for largest, target in ((1.0, 2.0), (3.0, 6.0)):
+        agent = make_agent(gamma=0.5)
+        agent.value_offset += 100
+        metrics = agent.update(batch, largest)
+        assert metrics["loss"].item() == pytest.approx((metrics["mean_q"].item() - target) ** 2)
+
+
 def test_terminated_and_truncated_give_different_targets():
     """One last step of an episode, stored once as truncated and once as terminated."""
     buffer = ReplayBuffer(2, 4, CPU)
@@ -183,12 +205,22 @@ def test_update_moves_what_it_should():
         for parameter in agent.target_parameters:
             parameter.add_(torch.randn_like(parameter))
     old_q, old_target = ([p.detach().clone() for p in ps] for ps in (agent.parameters, agent.target_parameters))
-    metrics = agent.update(random_batch())
+    metrics = agent.update(random_batch(), 1.0)
     for old, new, old_t, new_t in zip(old_q, agent.parameters, old_target, agent.target_parameters):
         assert (old != new).any()
         torch.testing.assert_close(new_t, 0.75 * old_t + 0.25 * new.detach())
         assert not new_t.requires_grad
     assert set(metrics) == {"loss", "mean_q"} and not any(value.requires_grad for value in metrics.values())
+
+
+def test_learning_rate_decays():
+    """1, 2/3, 1/2 … of the first after 0, 1, 2 … updates with a decay of 2."""
+    agent = make_agent(learning_rate=0.01, learning_rate_decay=2)
+    rates = []
+    for _ in range(4):
+        rates.append(agent.optimizer.param_groups[0]["lr"])
+        agent.update(random_batch(), 1.0)
+    assert rates == pytest.approx([0.01, 0.01 / 1.5, 0.01 / 2, 0.01 / 2.5])
 
 
 def test_update_is_double_dqn():
@@ -203,7 +235,7 @@ def test_update_is_double_dqn():
         value = torch.where(own[:, 0] > own[:, 1], target[:, 0], target[:, 1])
         q = torch.where(actions == 0, *agent.q_network(observations).unbind(1))
         error = rewards + 0.9 * (1 - terminated) * value - q
-    metrics = agent.update(batch)
+    metrics = agent.update(batch, 1.0)
     torch.testing.assert_close(metrics["loss"], error.square().mean())
     torch.testing.assert_close(metrics["mean_q"], q.mean())
 
@@ -217,7 +249,7 @@ def test_learns_values_of_a_known_chain():
         actions = torch.arange(16) % 2
         batch = observations, actions, torch.ones(16), torch.full((16,), terminated), observations
         for _ in range(400):
-            agent.update(batch)
+            agent.update(batch, 1.0)
         assert agent.q_network(torch.ones(4)).tolist() == pytest.approx([value, value], abs=0.02)
 
 
@@ -230,7 +262,7 @@ def test_offset_is_added_to_both_networks():
     for parameter in [*agent.parameters, *agent.target_parameters]:
         parameter.data.zero_()
     observations, actions = torch.zeros(2, 4), torch.tensor([0, 1])
-    metrics = agent.update((observations, actions, torch.ones(2), torch.tensor([0.0, 1.0]), observations))
+    metrics = agent.update((observations, actions, torch.ones(2), torch.tensor([0.0, 1.0]), observations), 2.0)
     assert metrics["mean_q"].item() == pytest.approx(20)
     assert metrics["loss"].item() == pytest.approx(((1 + 0.9 * 20 - 20) ** 2 + (1 - 20) ** 2) / 2)
     without = make_agent(value_offset=False)
@@ -251,11 +283,11 @@ def test_state_continues_exactly():
     torch.manual_seed(0)
     agent, batches = make_agent(), [random_batch() for _ in range(6)]
     for batch in batches[:3]:
-        agent.update(batch)
+        agent.update(batch, 1.0)
     other = make_agent()
     other.load_state(common.pickle.loads(common.pickle.dumps(agent.state())))
     for batch in batches[3:]:
-        agent.update(batch), other.update(batch)
+        agent.update(batch, 1.0), other.update(batch, 1.0)
     for mine, its in zip(tensors(agent.state()), tensors(other.state()), strict=True):
         assert torch.equal(mine, its)
 
@@ -379,7 +411,7 @@ def test_imports_without_pybullet():
         ("--num-iterations 0", "num-iterations"),
         ("--num-iterations -5", "num-iterations"),
         ("--num-envs 0", "num-envs"),
-        ("--gamma 1", "value-offset"),
+        ("--gamma 1", "gamma"),
         ("--run-dir .", "not empty"),
         ("--resume nowhere", "nowhere"),
         ("--evaluate nowhere.pt2", "nowhere.pt2"),
