@@ -97,7 +97,6 @@ def select_device(name, local_rank=0):
         if index >= torch.cuda.device_count():
             raise InputError(f"--device {name}: CUDA GPU {index} is not there ({torch.cuda.device_count()} found)")
         device = torch.device("cuda", index)
-        torch.cuda.set_device(device)
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise InputError("--device mps: there is no MPS device here; use auto or cpu")
     return device
@@ -452,6 +451,7 @@ class Run:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.ranks.world_size} processes")
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
+        self.device = select_device(config.device, self.ranks.local_rank)
         if config.resume:
             self.path = Path(config.resume)
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
@@ -474,13 +474,14 @@ class Run:
         # The workers are forked here, before anything has used a GPU.
         seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
         self.evaluations = Evaluations(evaluate, config.env_id, seeds, self.ranks)
-        self.device = select_device(config.device, self.ranks.local_rank)
         self.stop = StopRequest()
         self.stack = contextlib.ExitStack()
         keep_freed_memory()
         torch.set_num_threads(config.num_threads)
 
     def __enter__(self):
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)
         self.stack.callback(self.evaluations.close)
         self.enter(self.stop)
         if self.writes:
@@ -874,7 +875,8 @@ def plot_learning_curve(path, tables, title, reward_threshold=None, random_retur
         for key in [key for key in (rows[0] if rows else {}) if key.endswith(ending)]:
             axes.plot([row["step"] for row in rows], [row[key] for row in rows], label=key)
         axes.set(title=label, xlabel="gradient updates")
-        axes.legend(fontsize="small")
+        if rows:
+            axes.legend(fontsize="small")
     losses.set_yscale("symlog", linthresh=1e-3)
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
