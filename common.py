@@ -871,13 +871,12 @@ def plot_learning_curve(path, tables, title, reward_threshold=None, random_retur
     returns.set(title=title, xlabel="gradient updates", ylabel="return")
     returns.legend(fontsize="small")
     rows = tables.get("train", [])
-    for axes, ending, label in ((losses, "loss", "loss"), (values, "mean_q", "mean Q")):
-        for key in [key for key in (rows[0] if rows else {}) if key.endswith(ending)]:
-            axes.plot([row["step"] for row in rows], [row[key] for row in rows], label=key)
+    for axes, keys, label in ((losses, ("loss", "critic_loss"), "loss"), (values, ("mean_q",), "mean Q")):
+        for key in keys:
+            if rows and key in rows[0]:
+                axes.plot([row["step"] for row in rows], [row[key] for row in rows])
         axes.set(title=label, xlabel="gradient updates")
-        if rows:
-            axes.legend(fontsize="small")
-    losses.set_yscale("symlog", linthresh=1e-3)
+    losses.set_yscale("log")
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
