@@ -5,8 +5,10 @@ of its own (setsid), so that whatever outlives it can be found. A hook is a func
 with the script's module in the new process, before its `main`.
 """
 
+import atexit
 import csv
 import importlib
+import io
 import os
 import pickle
 import signal
@@ -44,6 +46,7 @@ class Process:
             Process.server = subprocess.Popen(
                 [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
             )
+            atexit.register(Process.server.communicate)
         self.output = Path(output)
         self.output.mkdir(parents=True)
         self.status = None
@@ -160,15 +163,18 @@ def _serve():
     requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     sys.path.insert(0, str(ROOT))
-    import matplotlib.figure  # noqa: F401
+    import matplotlib.figure
     import torch
+    import tyro
     from torch.utils.tensorboard import SummaryWriter  # noqa: F401
 
     import common
 
+    # Done once, these import much and fill caches.
+    matplotlib.figure.Figure().savefig(io.BytesIO(), format="png")
+    torch.export.save(common.PolicyFile(torch.nn.Linear(1, 1), (1,)).program, io.BytesIO())
     for script in SCRIPTS:
-        importlib.import_module(script)
-    common.PolicyFile(torch.nn.Linear(1, 1), (1,))  # imports the compiler
+        tyro.cli(importlib.import_module(script).Config, args=[])
     while True:
         try:
             request, argument = pickle.load(requests)
