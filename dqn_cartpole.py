@@ -273,8 +273,8 @@ class DQNAgent:
     def update(self, batch, largest_reward):
         """One gradient step of the Q-network, then of its target.
 
-        `batch` is what `ReplayBuffer.sample` returns, `largest_reward` the largest ever stored. Returns the scalars to log, as tensors on the device: reading a
-        number back here would make a GPU wait at every step.
+        `batch` is what `ReplayBuffer.sample` returns, `largest_reward` the largest ever stored. Returns the scalars to
+        log, as tensors on the device: reading a number back here would make a GPU wait at every step.
         """
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
