@@ -1,6 +1,6 @@
 """Deep Q-learning teaches a cart to balance a pole.
 
-    python dqn_cartpole.py                                    # about SECONDS seconds on two CPU cores, return 200
+    python dqn_cartpole.py                                    # less than a minute on two CPU cores, return 200
     python dqn_cartpole.py --env-id CartPole-v1 --num-iterations 50000
     python dqn_cartpole.py --resume runs/RUN                  # continues a run that was stopped or killed
     python dqn_cartpole.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy

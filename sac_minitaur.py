@@ -1,6 +1,6 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
-    python sac_minitaur.py                                    # about MINUTES minutes on two CPU cores, return RETURN
+    python sac_minitaur.py                                    # about half an hour on two CPU cores, return 9 to 13
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy
@@ -8,7 +8,7 @@
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every value of theirs is a default here but those
-marked "ours" in `Config`, each for a reason that README's ablation table measures.
+marked "ours" in `Config`, each for a reason that README gives.
 """
 
 import math

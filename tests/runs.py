@@ -46,7 +46,7 @@ class Process:
             Process.server = subprocess.Popen(
                 [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
             )
-            atexit.register(Process.server.communicate)
+            atexit.register(Process.server.stdin.close)
         self.output = Path(output)
         self.output.mkdir(parents=True)
         self.status = None
@@ -64,8 +64,12 @@ class Process:
 
     def wait(self, seconds=600):
         """The exit status, negative for a signal, once the process and all that it started are gone."""
-        wait_until(lambda: self.poll() is not None, seconds)
-        wait_until(lambda: not session(self.pid), seconds=60)
+        try:
+            wait_until(lambda: self.poll() is not None, seconds)
+            wait_until(lambda: not session(self.pid), seconds=60)
+        finally:
+            for pid in session(self.pid):
+                os.kill(pid, signal.SIGKILL)
         return self.status
 
     def kill(self, number=signal.SIGKILL):
@@ -183,6 +187,8 @@ def _serve():
         if request == "start":
             reply = os.fork()
             if reply == 0:
+                requests.close()
+                replies.close()
                 return _run(*argument)
         else:
             pid, status = os.waitpid(argument, os.WNOHANG)
