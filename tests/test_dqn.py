@@ -375,11 +375,11 @@ def test_exported_policy_acts_as_the_policy(tiny_run):
         assert torch.equal(exported(observations), agent.policy(observations))
 
 
-@pytest.mark.parametrize("seed", (100, 101))
+@pytest.mark.parametrize("seed", (0, 1))
 def test_learns_cartpole(seed, tmp_path):
     """195 is the task's own threshold. A random policy stays 22 steps on average.
 
-    Not every seed gets there: of 100 to 115, 11 and 12, the last stays near 160, also after 20 000 updates.
+    The first two seeds. Not all get there: of 0 to 9, 100 to 115, 11 and 12, the last stays near 160 for ever.
     """
     config = Config(
         seed=seed, num_iterations=5000, eval_interval=500, device="cpu", video=False, run_dir=str(tmp_path / "run")
