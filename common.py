@@ -318,6 +318,8 @@ class Evaluations:
         )
         # The first call forks the workers: now, before anything has used a GPU or started threads.
         self.pool.submit(int).result()
+        for worker in self.pool._processes.values():
+            worker.terminate = worker.kill  # when one has died the pool ends the others, who ignore SIGTERM
 
     def start(self, header, policy):
         """Starts evaluating a copy of `policy` (None: random actions), to be reported with `header`, a dict."""
@@ -355,10 +357,9 @@ class Evaluations:
 
     def close(self):
         """Ends the workers without waiting for what they still do."""
-        workers = list((self.pool._processes or {}).values())
-        self.pool.shutdown(wait=False, cancel_futures=True)
-        for worker in workers:
+        for worker in self.pool._processes.values():
             worker.kill()
+        self.pool.shutdown(cancel_futures=True)
 
 
 def _start_pool_worker():
@@ -482,20 +483,22 @@ class Run:
     def __enter__(self):
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)
-        self.stack.callback(self.evaluations.close)
-        self.enter(self.stop)
-        if self.writes:
-            if self.config.resume:
-                self._rewrite_tables()
-            self._save_config()
-        self.progress = self.enter(
-            tqdm(
-                total=self.config.num_iterations,
-                initial=self.session[1],
-                unit="step",
-                disable=not (self.writes and sys.stderr.isatty()),
+        with self.stack:  # ended here only if the directory cannot be written
+            self.stack.callback(self.evaluations.close)
+            self.enter(self.stop)
+            if self.writes:
+                if self.config.resume:
+                    self._rewrite_tables()
+                self._save_config()
+            self.progress = self.enter(
+                tqdm(
+                    total=self.config.num_iterations,
+                    initial=self.session[1],
+                    unit="step",
+                    disable=not (self.writes and sys.stderr.isatty()),
+                )
             )
-        )
+            self.stack = self.stack.pop_all()
         return self
 
     def enter(self, context):

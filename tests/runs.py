@@ -46,7 +46,8 @@ class Process:
             Process.server = subprocess.Popen(
                 [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
             )
-            atexit.register(Process.server.stdin.close)
+            atexit.register(Process.server.wait)
+            atexit.register(Process.server.stdin.close)  # called first: it ends the server
         self.output = Path(output)
         self.output.mkdir(parents=True)
         self.status = None

@@ -345,7 +345,9 @@ def kill_environment(module):
 
 
 def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
-    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", die_evaluating)
+    # Networks larger than a pipe: what is queued for the dead worker must not hold up the end.
+    large = ["--layers" if script == "dqn_cartpole" else "--actor-layers", 256, 256, "--num-eval-episodes", 20]
+    run = Process(script, flags(script, tmp_path / "run", *large), tmp_path / "output", die_evaluating)
     assert_one_line(run, 1, "worker process died", "--resume")
 
 
