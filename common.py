@@ -791,8 +791,8 @@ class PolicyFile:
         write_atomically(path, lambda file: file.write(archive.getvalue()))
 
 
-# What each string of an exported graph may be, by its key: names, operators that compute and nothing else, the symbol of
-# the batch size. PyTorch compiles names and guards as Python code, evaluates symbols and looks operators up anywhere.
+# What each string of an exported graph may be, by its key: names, operators that only compute, the symbol of the batch
+# size. PyTorch compiles names and guards as Python code, evaluates symbols and looks operators up anywhere.
 _OPERATOR = r"torch\.ops\.aten\.[a-z]\w*\.[A-Za-z]\w*"
 _PLAIN = {
     "target": _OPERATOR,
@@ -819,7 +819,7 @@ def _plain_graph(tree, key=None):
 
 
 def _plain_record(name, data):
-    """One record of an exported policy's archive. Raises ValueError when it is more than tensors and a graph of them."""
+    """One record of an exported policy's archive. Raises ValueError for more than tensors and a graph."""
     if name == "models/model.json":
         return json.dumps(_plain_graph(json.loads(data)))
     if name in ("data/weights/model_weights_config.json", "data/constants/model_constants_config.json"):

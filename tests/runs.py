@@ -26,8 +26,8 @@ TINY = {
     "dqn_cartpole": "--layers 32",
 }
 COMMON = (
-    "--device cpu --no-video --num-iterations 300 --initial-collect-steps 96 --batch-size 24 --replay-buffer-capacity 250 "
-    "--log-interval 20 --eval-interval 100 --num-eval-episodes 2 --checkpoint-interval 50"
+    "--device cpu --no-video --num-iterations 300 --initial-collect-steps 96 --batch-size 24 "
+    "--replay-buffer-capacity 250 --log-interval 20 --eval-interval 100 --num-eval-episodes 2 --checkpoint-interval 50"
 )
 
 

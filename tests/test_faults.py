@@ -241,7 +241,7 @@ def hostile_policies(path, created):
 
 @pytest.mark.filterwarnings("ignore")
 def test_hostile_policy_is_not_executed(reference, tmp_path):  # noqa: F811
-    """Neither when it is loaded nor when it is called. PyTorch's own loader shows that the files do what they should."""
+    """Neither when it is loaded nor when it is called. PyTorch's own loader shows that the files do create one."""
     path, created = tmp_path / "policy.pt2", tmp_path / "created"
     observation = torch.zeros(2, 3 if "sac_minitaur" in str(reference) else 4)
     live = set()
@@ -327,7 +327,8 @@ def test_rows_are_whole_or_not_there(tmp_path):
 
 
 def test_dead_environment_worker(tmp_path):
-    run = Process("sac_minitaur", flags("sac_minitaur", tmp_path / "run", "--num-envs", 2), tmp_path / "1", kill_environment)
+    arguments = flags("sac_minitaur", tmp_path / "run", "--num-envs", 2)
+    run = Process("sac_minitaur", arguments, tmp_path / "output", kill_environment)
     assert_one_line(run, 1, "worker process died", "--resume")
     assert checkpoint(tmp_path / "run")["shared"]["step"] == 0
 
