@@ -134,6 +134,17 @@ def episode_seed(*key):
 # Several processes training together
 
 
+class _Mean(torch.autograd.Function):
+    """The mean over the ranks. What it passes back is the same mean, of the ranks' gradients."""
+
+    @staticmethod
+    def forward(ctx, tensor):
+        dist.all_reduce(tensor := tensor.clone())
+        return tensor / dist.get_world_size()
+
+    backward = forward
+
+
 @dataclasses.dataclass(frozen=True)
 class Ranks:
     """This process among those that `torchrun` started; a single process is rank 0 of 1 and talks to nobody."""
@@ -166,10 +177,8 @@ class Ranks:
             gradient.copy_(mean.view_as(gradient))
 
     def mean(self, tensor):
-        """The mean over the ranks of a tensor, the same on each."""
-        if self.world_size > 1:
-            dist.all_reduce(tensor := tensor.clone())
-        return tensor / self.world_size
+        """The mean over the ranks of a tensor, the same on each. Gradients flow to all of them."""
+        return _Mean.apply(tensor) if self.world_size > 1 else tensor
 
     def any(self, flag):
         """Whether `flag` is true on any rank."""
@@ -280,6 +289,10 @@ class Episodes:
                 self.finished.append((self.returns[i], len(self.actions[i])))
                 self.number[i] += 1
                 self.actions[i], self.returns[i] = [], 0.0
+
+    def even(self):
+        """Whether the running episode of each environment is its first, third, fifth … (K,)."""
+        return np.array(self.number) % 2 == 0
 
     def state(self):
         """Everything needed to come back to this point, for a checkpoint."""

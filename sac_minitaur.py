@@ -11,7 +11,9 @@ Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every value of 
 marked "ours" in `Config`, each for a reason that README gives.
 """
 
+import copy
 import math
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 
@@ -53,16 +55,26 @@ class Config:
     """Adam's, for log α"""
     adam_epsilon: float = 1e-7
     """Adam's ε (Keras' default, which the tutorials leave unsaid)"""
-    target_update_tau: float = 0.05
-    """ours (theirs: 0.005): step of the target critics towards the critics, after every update. Values follow what is
-    earned with a time constant of 1 / (τ (1 − γ)) updates: 2 000, where theirs take 20 000, a fifth of the whole run"""
+    adam_beta1: float = 0.5
+    """ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient"""
+    critic_batch_norm: bool = True
+    """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
+    (arXiv:1902.05605): what is learned is then worth something a step later, not a fifth of the run"""
+    target_update_tau: float = 0.005
+    """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
     """discount"""
+    n_step: int = 3
+    """ours (theirs: 1): environment steps whose rewards a target sums before it bootstraps. One step of 0.01 s changes
+    the return so little that the critics' errors hide it"""
     reward_scaling: bool = True
-    """ours (theirs: none): divide the rewards by their spread in the initial random data, here 0.002 a step: values of
-    a thousandth are lost in the noise of new critics"""
-    reward_scale_factor: float = 0.2
+    """ours (theirs: none): divide the rewards by the spread of the n-step returns in the initial random data, here
+    0.005: values of a thousandth are lost in the noise of new critics"""
+    reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
+    mean_action_episodes: bool = True
+    """ours (theirs: none): every second episode is collected as an evaluation is, with the mean action, so that the
+    replay holds where that leads"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
@@ -73,8 +85,6 @@ class Config:
     """hidden units of the actor"""
     critic_layers: tuple[int, ...] = (256, 256)
     """hidden units of each critic"""
-    critic_layer_norm: bool = True
-    """ours (theirs: none): keeps the critics from diverging where the replay has no data (arXiv:2302.02948)"""
     observation_scaling: bool = True
     """ours (theirs: none): standardize observations by the mean and spread of the initial random data"""
 
@@ -337,13 +347,41 @@ def make_training_env(env_id):
 # The networks
 
 
-def mlp(inputs, hidden_layers, outputs, layer_norm=False):
-    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization)."""
+class BatchNorm(nn.BatchNorm1d):
+    """Normalizes features (B, F) by mean and spread of the batch, that of all ranks together, and in `eval` by running ones.
+
+    Momentum and ε are CrossQ's.
+    """
+
+    def __init__(self, features, ranks):
+        super().__init__(features, momentum=0.01, eps=1e-3)
+        self.ranks = ranks
+
+    def forward(self, x):
+        if self.ranks.world_size == 1 or not self.training:
+            return super().forward(x)
+        mean, mean_square = self.ranks.mean(torch.stack((x.mean(0), x.square().mean(0))))
+        variance = mean_square - mean.square()
+        with torch.no_grad():
+            batch_size = len(x) * self.ranks.world_size
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(variance * batch_size / (batch_size - 1), self.momentum)
+            self.num_batches_tracked += 1
+        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
+
+
+def mlp(inputs, hidden_layers, outputs, normalization=None):
+    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization).
+
+    `normalization(features)`, if any, makes a layer for the input of each.
+    """
     layers = []
-    for units in hidden_layers:
-        layers += [nn.Linear(inputs, units), *([nn.LayerNorm(units)] if layer_norm else []), nn.ReLU(inplace=True)]
+    for units in (*hidden_layers, outputs):
+        if normalization:
+            layers.append(normalization(inputs))
+        layers += [nn.Linear(inputs, units), nn.ReLU(inplace=True)]
         inputs = units
-    layers.append(nn.Linear(inputs, outputs))
+    layers.pop()  # nothing after the outputs
     for layer in layers:
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -402,11 +440,11 @@ class Actor(nn.Module):
 class TwinCritics(nn.Module):
     """Two estimates of Q(s, a), independent of each other but for their data."""
 
-    def __init__(self, observation_size, action_size, hidden_layers, layer_norm):
+    def __init__(self, observation_size, action_size, hidden_layers, normalization=None):
         super().__init__()
         inputs = observation_size + action_size
-        self.q1 = mlp(inputs, hidden_layers, 1, layer_norm)
-        self.q2 = mlp(inputs, hidden_layers, 1, layer_norm)
+        self.q1 = mlp(inputs, hidden_layers, 1, normalization)
+        self.q2 = mlp(inputs, hidden_layers, 1, normalization)
 
     def forward(self, observation, action):
         """(2, …) for scaled observations (…, O) and actions (…, A)."""
@@ -434,56 +472,72 @@ class Policy(nn.Module):
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
+    """The last `capacity` n-step transitions, on the training device, in float32, each one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. Only
-    `terminated` is kept: an episode cut off by its time limit has not ended, and its last state has a value.
+    A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
+    last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
+    time limit has not ended, and its last state has a value. Towards the end of an episode fewer than n steps are
+    left: n is then their number. Sampling is a single gather.
     """
 
-    def __init__(self, capacity, observation_size, action_size, device):
+    def __init__(self, capacity, observation_size, action_size, n_step, gamma, num_envs, device):
         self.sizes = (observation_size, action_size, 1, 1, observation_size)
+        self.n_step, self.gamma = n_step, gamma
         self.rows = torch.empty(capacity, sum(self.sizes), device=device)
         self.size = self.position = 0
+        # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
+        self.incomplete = [deque() for _ in range(num_envs)]
 
-    def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions: (K, O), (K, …), (K,), (K,), (K, O), as numpy arrays. Overwrites the oldest when full."""
-        columns = (observations, actions.reshape(len(actions), -1), rewards[:, None], terminated[:, None], next_observations)
-        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
-        for row in rows:
-            self.rows[self.position].copy_(row)
-            self.position = (self.position + 1) % len(self.rows)
-            self.size = min(self.size + 1, len(self.rows))
+    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
+        """Takes a step of each of K environments: (K, O), (K, …), (K,), (K,), (K,), (K, O), as numpy arrays.
+
+        Stores the transitions that it completes, over the oldest when full.
+        """
+        for k, steps in enumerate(self.incomplete):
+            steps.append((observations[k], actions[k].ravel(), rewards[k]))
+            ended = terminated[k] or truncated[k]
+            while len(steps) == self.n_step or (ended and steps):
+                n_step_return = sum(self.gamma**i * reward for i, (_, _, reward) in enumerate(steps))
+                discount = 0.0 if terminated[k] else self.gamma ** len(steps)
+                observation, action, _ = steps.popleft()
+                row = np.concatenate((observation, action, (n_step_return, discount), next_observations[k]))
+                self.rows[self.position].copy_(torch.from_numpy(row))
+                self.position = (self.position + 1) % len(self.rows)
+                self.size = min(self.size + 1, len(self.rows))
 
     def sample(self, batch_size):
         """A batch drawn uniformly with replacement: (B, O), (B, A), (B,), (B,), (B, O)."""
         indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
-        observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
-        return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
+        observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
+        return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
 
-    def observations_and_rewards(self):
+    def observations_and_returns(self):
         """All that is stored of these: (size, O), (size,)."""
-        observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
-        return observations, rewards.squeeze(1)
+        observations, _, returns, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return observations, returns.squeeze(1)
 
     def state(self):
-        """A copy of the filled part, for a checkpoint."""
-        return {"rows": self.rows[: self.size].cpu().clone(), "position": self.position}
+        """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
+        incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
+        return {"rows": self.rows[: self.size].cpu().clone(), "position": self.position, "incomplete": incomplete}
 
     def load_state(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
         self.rows[: self.size] = state["rows"].to(self.rows.device)
+        for steps, saved in zip(self.incomplete, state["incomplete"]):
+            steps.extend(tuple(value.numpy() for value in step) for step in saved)
 
 
 # The agent
 
 
-def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
-    """r + γ (1 − terminated) (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
+def td_targets(returns, discounts, next_q, next_log_probs, alpha):
+    """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
-    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum.
+    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
+    reward and γ (1 − terminated), n of them and what they leave of γ (the entropy of the steps between is left out).
     """
-    next_value = next_q.amin(0) - alpha * next_log_probs
-    return rewards + gamma * (1 - terminated) * next_value
+    return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
 
 
 def critic_loss(q, targets, weight):
@@ -516,17 +570,16 @@ class SACAgent:
         self.scaling = ObservationScaling(observation_size).to(device)
         self.reward_scale = torch.tensor(config.reward_scale_factor, device=device)
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
-        critic_arguments = (observation_size, action_size, config.critic_layers, config.critic_layer_norm)
-        self.critics = TwinCritics(*critic_arguments).to(device)
-        self.target_critics = TwinCritics(*critic_arguments).to(device).requires_grad_(False)
-        self.target_critics.load_state_dict(self.critics.state_dict())
+        normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
+        self.critics = TwinCritics(observation_size, action_size, config.critic_layers, normalization).to(device)
+        # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
+        self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
         self.policy = Policy(self.scaling, self.actor, action_space).to(device)
 
         self.critic_parameters = list(self.critics.parameters())
-        self.target_parameters = list(self.target_critics.parameters())
         self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
-        adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
+        adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, who learn from the same sample of actions.
         groups = [
@@ -539,20 +592,25 @@ class SACAgent:
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
-    def fit_scaling(self, observations, rewards):
-        """Fixes the scales of observations (N, O) and rewards (N,) from the initial random data of all ranks."""
+    def fit_scaling(self, observations, returns):
+        """Fixes the scales of observations (N, O) and rewards, by their n-step returns (N,), of all ranks' first data."""
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.reward_scaling:
-            mean = self.ranks.mean(rewards.mean())
-            spread = self.ranks.mean((rewards - mean).square().mean()).sqrt()
+            mean = self.ranks.mean(returns.mean())
+            spread = self.ranks.mean((returns - mean).square().mean()).sqrt()
             self.reward_scale /= torch.where(spread > 1e-6, spread, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
-    def act(self, observations):
-        """Sampled actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy."""
-        observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
-        actions, _ = self.actor.sample(self.scaling(observations))
+    def act(self, observations, sampled):
+        """Actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy.
+
+        They are drawn from the policy where `sampled` (K,) is true and its mean action elsewhere.
+        """
+        observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
+        actions, _ = self.actor.sample(observations)
+        mean, _ = self.actor(observations)
+        actions = torch.where(torch.as_tensor(sampled, device=self.device)[:, None], actions, mean.tanh())
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
@@ -562,16 +620,24 @@ class SACAgent:
         number back here would make a GPU wait at every step.
         """
         config = self.config
-        observations, actions, rewards, terminated, next_observations = batch
+        observations, actions, returns, discounts, next_observations = batch
         observations, next_observations = self.scaling(observations), self.scaling(next_observations)
-        rewards = self.reward_scale * rewards
+        returns = self.reward_scale * returns
         alpha = self.log_alpha.detach().exp()
 
         with torch.no_grad():
             next_actions, next_log_probs = self.actor.sample(next_observations)
+        if self.target_critics:
+            q = self.critics(observations, actions)
             next_q = self.target_critics(next_observations, next_actions)
-            targets = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)
-        q = self.critics(observations, actions)
+        else:
+            # Both in one pass: normalized apart, what the replay did and what the actor would do could not be compared.
+            self.critics.train()
+            both = torch.cat((observations, next_observations)), torch.cat((actions, next_actions))
+            q, next_q = self.critics(*both).chunk(2, dim=1)
+            self.critics.eval()
+        with torch.no_grad():
+            targets = td_targets(returns, discounts, next_q, next_log_probs, alpha)
         loss_q = critic_loss(q, targets, config.critic_loss_weight)
         self._step(self.critic_optimizer, loss_q, self.critic_parameters)
 
@@ -580,8 +646,10 @@ class SACAgent:
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
         self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
 
-        with torch.no_grad():
-            torch._foreach_lerp_(self.target_parameters, self.critic_parameters, config.target_update_tau)
+        if self.target_critics:
+            target_parameters = list(self.target_critics.parameters())
+            with torch.no_grad():
+                torch._foreach_lerp_(target_parameters, self.critic_parameters, config.target_update_tau)
         return {
             "critic_loss": loss_q.detach(),
             "actor_loss": loss_pi.detach(),
@@ -599,16 +667,16 @@ class SACAgent:
 
     def state(self):
         """Everything that an update depends on and changes, for a checkpoint."""
-        return {
+        state = {
             "scaling": self.scaling.state_dict(),
             "actor": self.actor.state_dict(),
             "critics": self.critics.state_dict(),
-            "target_critics": self.target_critics.state_dict(),
             "log_alpha": self.log_alpha.detach(),
             "reward_scale": self.reward_scale,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
         }
+        return state | ({"target_critics": self.target_critics.state_dict()} if self.target_critics else {})
 
     def load_state(self, state):
         for name, saved in state.items():
@@ -658,11 +726,11 @@ def check(config):
         config,
         *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
-        "checkpoint_interval",
+        *("checkpoint_interval", "n_step"),
     )
-    collected = min(config.initial_collect_steps, config.replay_buffer_capacity)
-    if config.batch_size > collected:
-        raise InputError(f"--batch-size {config.batch_size} is more than the {collected} transitions collected first")
+    stored = min(config.initial_collect_steps - config.num_envs * (config.n_step - 1), config.replay_buffer_capacity)
+    if config.batch_size > stored:
+        raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
 
 
 def train(config):
@@ -683,7 +751,12 @@ def train(config):
         envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=True))
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = SACAgent(config, observation_space, action_space, run.device, ranks)
-        buffer = ReplayBuffer(config.replay_buffer_capacity, agent.observation_size, agent.action_size, run.device)
+        buffer = ReplayBuffer(
+            config.replay_buffer_capacity,
+            *(agent.observation_size, agent.action_size),
+            *(config.n_step, config.gamma, config.num_envs),
+            run.device,
+        )
         policy_file = common.PolicyFile(agent.policy, observation_space.shape)
         torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
         run.print_start(observation_space, action_space, buffer.rows.nbytes)
@@ -712,7 +785,10 @@ def train(config):
         observations, _ = envs.reset()
         while step < config.num_iterations and not stopping:
             exploring = env_steps < config.initial_collect_steps
-            actions = agent.random_actions(config.num_envs) if exploring else agent.act(observations)
+            if exploring:
+                actions = agent.random_actions(config.num_envs)
+            else:
+                actions = agent.act(observations, sampled=episodes.even() | (not config.mean_action_episodes))
             envs.step_async(actions)  # the physics runs beside the updates, which sample what was stored before
             env_steps += steps_per_round
 
@@ -729,13 +805,14 @@ def train(config):
 
             next_observations, rewards, terminated, truncated, infos = envs.step_wait()
             done = terminated | truncated
-            buffer.add(observations, actions, rewards, terminated, common.last_observations(next_observations, infos))
+            last_observations = common.last_observations(next_observations, infos)
+            buffer.add(observations, actions, rewards, terminated, truncated, last_observations)
             episodes.record(actions, rewards, done)
             observations = next_observations
             common.require_finite(step, metrics)
 
             if exploring and env_steps >= config.initial_collect_steps:
-                agent.fit_scaling(*buffer.observations_and_rewards())
+                agent.fit_scaling(*buffer.observations_and_returns())
                 run.start_evaluation(step, env_steps, agent.policy)
             if env_steps // steps_per_round % 100 == 0:
                 run.report_evaluations(policy_file)

@@ -25,10 +25,12 @@ ROOT = Path(__file__).parent.parent
 TUTORIALS = dict(
     observation_scaling=False,
     reward_scaling=False,
-    critic_layer_norm=False,
+    critic_batch_norm=False,
+    adam_beta1=0.9,
+    n_step=1,
+    mean_action_episodes=False,
     initial_log_alpha=0.0,
     target_entropy_per_action=-0.5,
-    target_update_tau=0.005,
     reward_scale_factor=1.0,
     replay_buffer_capacity=10_000,
 )
@@ -47,9 +49,9 @@ def make_batch(size=32, observation_size=3, action_size=2):
     generator = torch.Generator().manual_seed(1)
     observations, next_observations = torch.randn(2, size, observation_size, generator=generator)
     actions = 2 * torch.rand(size, action_size, generator=generator) - 1
-    rewards = torch.randn(size, generator=generator)
-    terminated = (torch.rand(size, generator=generator) < 0.3).float()
-    return observations, actions, rewards, terminated, next_observations
+    returns = torch.randn(size, generator=generator)
+    discounts = 0.97 * (torch.rand(size, generator=generator) > 0.3)
+    return observations, actions, returns, discounts, next_observations
 
 
 # The losses
@@ -57,15 +59,14 @@ def make_batch(size=32, observation_size=3, action_size=2):
 
 def test_td_targets():
     targets = sac_minitaur.td_targets(
-        rewards=torch.tensor([1.0, 1.0, -2.0]),
-        terminated=torch.tensor([0.0, 1.0, 0.0]),
+        returns=torch.tensor([1.0, 1.0, -2.0]),
+        discounts=torch.tensor([0.9, 0.0, 0.81]),
         next_q=torch.tensor([[4.0, 4.0, 7.0], [3.0, 3.0, 9.0]]),
         next_log_probs=torch.tensor([-2.0, -2.0, 4.0]),
         alpha=torch.tensor(0.5),
-        gamma=0.9,
     )
-    # The first two differ in `terminated` alone: 1 + 0.9 (3 + 0.5 · 2) and 1. The third: −2 + 0.9 (7 − 0.5 · 4).
-    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.5]))
+    # The second's episode has ended: 1 + 0.9 (3 + 0.5 · 2), 1, and two steps before its value −2 + 0.81 (7 − 0.5 · 4).
+    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.05]))
 
 
 def test_critic_loss():
@@ -196,64 +197,102 @@ def test_policy_acts_with_the_mean_in_the_tasks_units():
 # The replay buffer
 
 
-def transitions(first, count):
-    """Numbered transitions (2 observations, 1 action) in which every number tells where it belongs."""
-    n = np.arange(first, first + count, dtype=np.float32)
-    return np.stack((n, n + 0.1), 1), n[:, None] + 0.2, n + 0.3, n % 2 == 1, np.stack((n + 0.4, n + 0.5), 1)
+CPU = torch.device("cpu")
+
+
+def numbered(first, count):
+    """Steps of one environment (2 observations, 1 action) whose numbers tell where they belong: 0 to 3 are an episode
+    that ends, 4 to 6 one that its time limit ends, 7 the beginning of a third."""
+    for n in np.arange(first, first + count, dtype=np.float32):
+        yield np.array([[n, n + 0.1]]), np.array([[n + 0.2]]), 10**n[None], n[None] == 3, n[None] == 6, np.array([[n + 0.4, n]])
+
+
+def filled(buffer, first, count):
+    for step in numbered(first, count):
+        buffer.add(*step)
+    return buffer
+
+
+def test_n_step_transitions():
+    buffer = filled(ReplayBuffer(9, 2, 1, 3, 0.5, 1, CPU), 0, 8)
+    observations, actions, returns, discounts, last = buffer.rows[: buffer.size].split((2, 1, 1, 1, 2), dim=1)
+    n = torch.arange(7.0)[:, None]  # the eighth is not complete
+    torch.testing.assert_close(torch.cat((observations, actions), dim=1), torch.cat((n, n + 0.1, n + 0.2), dim=1))
+    # r₀ + r₁ / 2 + r₂ / 4, to the end of the episode and never beyond.
+    expected = [1 + 5 + 25, 10 + 50 + 250, 100 + 500, 1000, 1e4 + 5e4 + 25e4, 1e5 + 5e5, 1e6]
+    torch.testing.assert_close(returns[:, 0], torch.tensor(expected))
+    # Two episodes' ends: after a fall there is no value, at the time limit that of the state reached.
+    assert discounts[:, 0].tolist() == [0.125, 0, 0, 0, 0.125, 0.25, 0.5]
+    assert last[:, 1].tolist() == [2, 3, 3, 3, 6, 6, 6]
+
+    one_step = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU), 0, 8).rows[:8]
+    assert one_step[:, 3].tolist() == [10**n for n in range(8)]
+    assert one_step[:, 4].tolist() == [0.5, 0.5, 0.5, 0, 0.5, 0.5, 0.5, 0.5] and one_step[:, 6].tolist() == [*range(8)]
+
+
+def test_each_environment_has_n_step_transitions_of_its_own():
+    both, single = ReplayBuffer(99, 2, 1, 3, 0.5, 2, CPU), ReplayBuffer(99, 2, 1, 3, 0.5, 1, CPU)
+    for mine, other in zip(numbered(0, 7), numbered(1, 7)):
+        both.add(*(np.concatenate(pair) for pair in zip(mine, other)))
+        single.add(*other)
+    rows = both.rows[: both.size]
+    assert len(rows) == 7 + single.size
+    assert [row.tolist() for row in single.rows[: single.size] if not (rows == row).all(1).any()] == []
 
 
 def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     torch.manual_seed(0)
-    buffer = ReplayBuffer(5, 2, 1, torch.device("cpu"))
+    buffer = ReplayBuffer(5, 2, 1, 1, 0.5, 1, CPU)
     buffer.rows.fill_(torch.nan)
-    buffer.add(*transitions(0, 3))
-    observations, actions, rewards, terminated, next_observations = buffer.sample(200)
+    filled(buffer, 0, 3)
+    observations, actions, returns, discounts, next_observations = buffer.sample(200)
     n = observations[:, 0]
     assert set(n.tolist()) == {0, 1, 2}
     assert observations.shape == next_observations.shape == (200, 2) and actions.shape == (200, 1)
-    assert rewards.shape == terminated.shape == (200,)
-    torch.testing.assert_close(observations[:, 1], n + 0.1)
+    assert returns.shape == discounts.shape == (200,)
     torch.testing.assert_close(actions[:, 0], n + 0.2)
-    torch.testing.assert_close(rewards, n + 0.3)
-    assert torch.equal(terminated, n % 2)
-    torch.testing.assert_close(next_observations, torch.stack((n + 0.4, n + 0.5), 1))
+    torch.testing.assert_close(returns, 10**n)
+    torch.testing.assert_close(next_observations, torch.stack((n + 0.4, n), 1))
 
-    buffer.add(*transitions(3, 4))  # across the end
+    filled(buffer, 3, 4)  # across the end
     assert buffer.size == 5 and buffer.position == 2
     counts = buffer.sample(5000)[0][:, 0].long().bincount()
     assert counts[:2].tolist() == [0, 0] and counts[2:].min() > 850 and len(counts) == 7
-    observations, rewards = buffer.observations_and_rewards()
-    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and rewards.shape == (5,)
+    observations, returns = buffer.observations_and_returns()
+    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and returns.shape == (5,)
 
 
-@pytest.mark.parametrize("stored", [3, 7])
+@pytest.mark.parametrize("stored", [3, 8])
 def test_replay_buffer_goes_on_from_its_state(stored):
-    buffer, other = (ReplayBuffer(5, 2, 1, torch.device("cpu")) for _ in range(2))
-    buffer.add(*transitions(0, stored))
+    buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
+    other = ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU)
     state = buffer.state()
     other.load_state(state)
     for each in (buffer, other):
-        each.add(*transitions(stored, 3))
-    assert torch.equal(other.rows, buffer.rows)
-    assert (other.size, other.position) == (buffer.size, buffer.position) == (5, (stored + 3) % 5)
-    assert len(state["rows"]) == min(stored, 5)  # a copy: what was added later is not in it
-    assert state["rows"].max() < stored
+        filled(each, stored, 4)
+    assert torch.equal(other.rows, buffer.rows) and buffer.size == other.size == 5
+    assert other.position == buffer.position
+    assert len(state["rows"]) == min(stored - 2, 5)  # a copy: what was added later is not in it
+    assert state["rows"][:, 0].max() < stored
 
 
 # The agent
 
 
-def test_update_is_one_step_of_each_gradient():
+@pytest.mark.parametrize("batch_norm", (True, False))
+def test_update_is_one_step_of_each_gradient(batch_norm):
     """Against separate gradients and Adam's first step by hand: −lr · g / (|g| + ε)."""
-    agent = make_agent(adam_epsilon=1e-2, critic_learning_rate=1e-3, actor_learning_rate=2e-3, alpha_learning_rate=3e-3)
+    choices = dict(adam_epsilon=1e-2, critic_learning_rate=1e-3, actor_learning_rate=2e-3, alpha_learning_rate=3e-3)
+    agent = make_agent(**choices, critic_batch_norm=batch_norm)
     config, batch = agent.config, make_batch()
     agent.fit_scaling(5 * batch[0] + 1, 3 * batch[2])
     observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
-    actions, rewards, terminated = batch[1], agent.reward_scale * batch[2], batch[3]
+    actions, returns, discounts = batch[1], agent.reward_scale * batch[2], batch[3]
     alpha = agent.log_alpha.exp().item()
-    with torch.no_grad():
-        for parameter in agent.target_critics.parameters():  # else they would equal the critics
-            parameter += 0.05 * torch.randn_like(parameter)
+    if not batch_norm:
+        with torch.no_grad():
+            for parameter in agent.target_critics.parameters():  # else they would equal the critics
+                parameter += 0.05 * torch.randn_like(parameter)
     actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
 
     def adam_step(parameters, gradients, learning_rate):
@@ -267,9 +306,13 @@ def test_update_is_one_step_of_each_gradient():
     torch.manual_seed(5)
     with torch.no_grad():
         next_actions, next_log_probs = actor.sample(next_observations)
-        next_value = target_critics(next_observations, next_actions).min(0).values - alpha * next_log_probs
-        targets = torch.where(terminated == 1, rewards, rewards + config.gamma * next_value)
-    q = critics(observations, actions)
+    if batch_norm:
+        q = critics(torch.cat((observations, next_observations)), torch.cat((actions, next_actions)))
+        q, next_q = q[:, :32], q[:, 32:].detach()
+        critics.eval()
+    else:
+        q, next_q = critics(observations, actions), target_critics(next_observations, next_actions).detach()
+    targets = returns + discounts * (next_q.min(0).values - alpha * next_log_probs)
     loss = 0.5 * ((q[0] - targets) ** 2).mean() + 0.5 * ((q[1] - targets) ** 2).mean()
     critic_gradients = torch.autograd.grad(loss, list(critics.parameters()))
     adam_step(critics.parameters(), critic_gradients, config.critic_learning_rate)
@@ -293,6 +336,8 @@ def test_update_is_one_step_of_each_gradient():
     assert agent.log_alpha.item() == pytest.approx(config.initial_log_alpha + step, abs=1e-6)
     assert metrics["alpha"].item() == pytest.approx(alpha)
 
+    if batch_norm:
+        return
     moved = zip(agent.target_critics.parameters(), target_critics.parameters(), agent.critics.parameters())
     for own, before, critic in moved:
         torch.testing.assert_close(own, before + config.target_update_tau * (critic - before), rtol=0, atol=1e-7)
@@ -302,13 +347,25 @@ def test_update_is_one_step_of_each_gradient():
 def test_update_learns_from_terminated_and_truncated_differently():
     batch = make_batch()
     losses = []
-    for terminated in (torch.zeros(32), torch.ones(32)):
+    for discounts in (torch.ones(32), torch.zeros(32)):
         torch.manual_seed(0)
-        agent = make_agent(initial_log_alpha=0.0, reward_scale_factor=1.0)
-        losses.append(agent.update((*batch[:3], terminated, batch[4]))["critic_loss"].item())
-    q = make_agent().critics(*batch[:2])
+        agent = make_agent(**TUTORIALS)
+        losses.append(agent.update((*batch[:3], discounts, batch[4]))["critic_loss"].item())
+    q = make_agent(**TUTORIALS).critics(*batch[:2])
     assert losses[1] == pytest.approx(0.5 * (q - batch[2]).square().mean(1).sum().item(), rel=1e-5)
     assert abs(losses[0] - losses[1]) > 0.01
+
+
+def test_act_samples_or_takes_the_mean():
+    agent = make_agent()
+    agent.fit_scaling(torch.randn(50, 3), torch.randn(50))
+    observations = torch.randn(4, 3)
+    torch.manual_seed(7)
+    actions = torch.from_numpy(agent.act(observations.numpy(), sampled=np.array([True, False, False, True])))
+    torch.manual_seed(7)
+    sampled, _ = agent.actor.sample(agent.scaling(observations))
+    assert torch.equal(actions[::3], sampled[::3].detach())
+    torch.testing.assert_close(actions[1:3], agent.policy(observations)[1:3].detach())
 
 
 @pytest.mark.parametrize("target_entropy, direction", [(10.0, 1), (-10.0, -1)])
@@ -341,25 +398,25 @@ def test_the_tutorials_values_are_the_defaults():
     config = Config()
     assert config.env_id == "MinitaurBulletEnv-v0" and config.num_iterations == 100_000
     assert config.initial_collect_steps == 10_000 and config.collect_steps_per_iteration == 1
-    assert config.batch_size == 256 and config.gamma == 0.99 and config.critic_loss_weight == 0.5
+    assert config.batch_size == 256 and config.gamma == 0.99 and config.target_update_tau == 0.005
     assert config.actor_learning_rate == config.critic_learning_rate == config.alpha_learning_rate == 3e-4
     assert config.actor_layers == config.critic_layers == (256, 256)
     assert (config.log_interval, config.eval_interval, config.num_eval_episodes) == (5_000, 10_000, 20)
-    assert config.checkpoint_interval == 5_000
+    assert config.checkpoint_interval == 5_000 and config.critic_loss_weight == 0.5
 
 
 def test_the_tutorials_exact_choices_are_flags():
-    flags = """--no-observation-scaling --no-reward-scaling --no-critic-layer-norm --initial-log-alpha 0
-        --target-entropy-per-action -0.5 --target-update-tau 0.005 --reward-scale-factor 1
-        --replay-buffer-capacity 10000"""
+    flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
+        --adam-beta1 0.9 --n-step 1 --no-mean-action-episodes --initial-log-alpha 0
+        --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
     agent = make_agent(**TUTORIALS)
     observations = 100 * torch.randn(50, 3)
     agent.fit_scaling(observations, 7 * torch.randn(50))
     assert torch.equal(agent.scaling(observations), observations)
     assert agent.reward_scale == 1 and agent.log_alpha.exp() == 1 and agent.target_entropy == -2 / 2
-    assert not any(isinstance(module, nn.LayerNorm) for module in agent.critics.modules())
-    assert any(isinstance(module, nn.LayerNorm) for module in make_agent().critics.modules())
+    assert not any(isinstance(module, nn.BatchNorm1d) for module in agent.critics.modules())
+    assert agent.target_critics and not make_agent().target_critics
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
@@ -468,11 +525,11 @@ def tiny_run(tmp_path_factory):
 def test_train_does_what_the_config_says(tiny_run):
     path, calls = tiny_run
     assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"]
-    observations, rewards = calls[0][1]
-    assert observations.shape == (250, 3) and rewards.shape == (250,)
+    observations, returns = calls[0][1]
+    assert observations.shape == (248, 3) and returns.shape == (248,)  # of 3 steps: the last two are not complete
     assert all(batch[0].shape == (32, 3) for _, (batch,) in calls[1:])
     shared, own = read_checkpoint(path)
-    assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) == 250 + 60
+    assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) + 2 == 250 + 60
     assert json.loads((path / "config.json").read_text())["num_iterations"] == 60
     files = {"config.json", "train.csv", "eval.csv", "random.csv", "learning_curve.png", "checkpoint.pt", "policy.pt2"}
     assert files | {"best_policy.pt2"} <= {file.name for file in path.iterdir()}
@@ -505,7 +562,7 @@ def test_train_moves_every_parameter(tiny_run):
         spaces = env.observation_space, env.action_space
     untrained = SACAgent(config, *spaces, torch.device("cpu"), common.Ranks()).state()
     trained = read_checkpoint(path)[0]["agent"]
-    for name in ("actor", "critics", "target_critics", "scaling"):
+    for name in ("actor", "critics", "scaling"):
         assert trained[name].keys() == untrained[name].keys()
         for key, value in trained[name].items():
             assert not torch.equal(value, untrained[name][key]) and value.isfinite().all(), (name, key)
@@ -549,10 +606,10 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
     path, calls = train(tmp_path / "run", num_envs=3)
     # 250 is no multiple of 3. The scaling is fitted before the first update all the same, on all there is.
-    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252
+    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252 - 3 * 2
     assert all(row["env_steps"] - 250 - row["step"] in range(6) for row in read_csv(path / "train.csv"))
     shared, own = read_checkpoint(path)
-    assert shared["env_steps"] == len(own["buffer"]["rows"]) == 312
+    assert shared["env_steps"] == len(own["buffer"]["rows"]) + 3 * 2 == 312
     starts = own["buffer"]["rows"][:3, :3]
     assert len(starts.unique(dim=0)) == 3  # each environment has episodes of its own
 
@@ -566,15 +623,16 @@ def test_several_steps_per_update_and_a_small_buffer(tmp_path):
 
 @pytest.mark.parametrize("env_id, num_envs", [("Truncated-v0", 2), ("Terminated-v0", 1)])
 def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
-    path, _ = train(tmp_path / "run", env_id=f"{__name__}:{env_id}", num_envs=num_envs, initial_collect_steps=40)
+    choices = {"num_envs": num_envs, "initial_collect_steps": 40, "n_step": 1}
+    path, _ = train(tmp_path / "run", env_id=f"{__name__}:{env_id}", **choices)
     rows = read_checkpoint(path)[1]["buffer"]["rows"]
-    observations, actions, rewards, terminated, next_observations = rows.split((2, 1, 1, 1, 2), dim=1)
+    observations, actions, rewards, discounts, next_observations = rows.split((2, 1, 1, 1, 2), dim=1)
     # Within an episode to its very end, never the first observation of the next.
     assert torch.equal(next_observations, observations + torch.tensor([0.0, 1.0]))
     assert observations[:, 1].unique().tolist() == [0, 1, 2, 3]
     assert torch.equal(rewards, next_observations[:, 1:])  # unscaled, as the environment gave them
     ended = next_observations[:, 1:] == 4
-    assert torch.equal(terminated, (ended if env_id == "Terminated-v0" else torch.zeros_like(ended)).float())
+    torch.testing.assert_close(discounts, 0.99 * ~ended if env_id == "Terminated-v0" else torch.full_like(discounts, 0.99))
     assert actions.abs().max() <= 1 and len(actions[:40].unique()) == 40
     # Every environment's episodes follow each other.
     for i in range(num_envs):
