@@ -72,9 +72,12 @@ class Config:
     0.005: values of a thousandth are lost in the noise of new critics"""
     reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
+    averaged_actor_tau: float = 0.001
+    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update. It acts
+    where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment falls"""
     mean_action_episodes: bool = True
-    """ours (theirs: none): every second episode is collected as an evaluation is, with the mean action, so that the
-    replay holds where that leads"""
+    """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean
+    action, so that the replay holds where that leads"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
@@ -348,7 +351,7 @@ def make_training_env(env_id):
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Normalizes features (B, F) by mean and spread of the batch, that of all ranks together, and in `eval` by running ones.
+    """Normalizes features (B, F) by mean and spread of the batch, all ranks' together; in `eval` mode by running ones.
 
     Momentum and ε are CrossQ's.
     """
@@ -558,6 +561,12 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
     return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
 
 
+@torch.no_grad()
+def average(slow, fast, tau):
+    """Moves the parameters of one network a step τ towards those of another."""
+    torch._foreach_lerp_(list(slow.parameters()), list(fast.parameters()), tau)
+
+
 class SACAgent:
     """Actor, twin critics with their targets, and the temperature α, with their optimizers."""
 
@@ -575,7 +584,8 @@ class SACAgent:
         # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
-        self.policy = Policy(self.scaling, self.actor, action_space).to(device)
+        self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.policy = Policy(self.scaling, self.averaged_actor, action_space).to(device)
 
         self.critic_parameters = list(self.critics.parameters())
         self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
@@ -605,16 +615,16 @@ class SACAgent:
     def act(self, observations, sampled):
         """Actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy.
 
-        They are drawn from the policy where `sampled` (K,) is true and its mean action elsewhere.
+        They are drawn from the policy where `sampled` (K,) is true; elsewhere they are the averaged actor's mean.
         """
         observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
         actions, _ = self.actor.sample(observations)
-        mean, _ = self.actor(observations)
+        mean, _ = self.averaged_actor(observations)
         actions = torch.where(torch.as_tensor(sampled, device=self.device)[:, None], actions, mean.tanh())
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
-        """One gradient step of the critics, then of the actor and α, then of the target critics.
+        """One gradient step of the critics, then of the actor and α, then of what follows them slowly.
 
         `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
         number back here would make a GPU wait at every step.
@@ -646,10 +656,9 @@ class SACAgent:
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
         self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
 
+        average(self.averaged_actor, self.actor, config.averaged_actor_tau)
         if self.target_critics:
-            target_parameters = list(self.target_critics.parameters())
-            with torch.no_grad():
-                torch._foreach_lerp_(target_parameters, self.critic_parameters, config.target_update_tau)
+            average(self.target_critics, self.critics, config.target_update_tau)
         return {
             "critic_loss": loss_q.detach(),
             "actor_loss": loss_pi.detach(),
@@ -670,6 +679,7 @@ class SACAgent:
         state = {
             "scaling": self.scaling.state_dict(),
             "actor": self.actor.state_dict(),
+            "averaged_actor": self.averaged_actor.state_dict(),
             "critics": self.critics.state_dict(),
             "log_alpha": self.log_alpha.detach(),
             "reward_scale": self.reward_scale,

@@ -71,9 +71,23 @@ def draw(experiment, title, threshold, names):
     figure.savefig(RESULTS / f"{experiment}.png", dpi=110)
 
 
+def print_summary(experiments):
+    print("\n| experiment | seeds | median final return | worst final return | median at half | median episode length |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for experiment in experiments:
+        evaluations = list(runs(experiment).values())
+        finals = [rows[-1]["average_return"] for rows in evaluations]
+        lengths = [rows[-1]["average_episode_length"] for rows in evaluations]
+        halves = [next(row["average_return"] for row in rows if row["step"] >= rows[-1]["step"] / 2) for rows in evaluations]
+        columns = f"{median(finals):.2f} | {min(finals):.2f} | {median(halves):.2f} | {median(lengths):.0f}"
+        print(f"| {experiment} | {len(finals)} | {columns} |")
+
+
 def main():
-    for experiment in sorted(path.name for path in RESULTS.iterdir() if path.is_dir()):
+    experiments = sorted(path.name for path in RESULTS.iterdir() if path.is_dir())
+    for experiment in experiments:
         print_table(experiment)
+    print_summary(experiments)
     for experiment, figure in FIGURES.items():
         draw(experiment, *figure)
 

@@ -28,6 +28,7 @@ TUTORIALS = dict(
     critic_batch_norm=False,
     adam_beta1=0.9,
     n_step=1,
+    averaged_actor_tau=1.0,
     mean_action_episodes=False,
     initial_log_alpha=0.0,
     target_entropy_per_action=-0.5,
@@ -295,6 +296,8 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
                 parameter += 0.05 * torch.randn_like(parameter)
     actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
 
+    averaged = [parameter.clone() for parameter in agent.averaged_actor.parameters()]
+
     def adam_step(parameters, gradients, learning_rate):
         with torch.no_grad():
             for parameter, gradient in zip(parameters, gradients):
@@ -336,6 +339,9 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     assert agent.log_alpha.item() == pytest.approx(config.initial_log_alpha + step, abs=1e-6)
     assert metrics["alpha"].item() == pytest.approx(alpha)
 
+    for own, before, mine in zip(agent.averaged_actor.parameters(), averaged, agent.actor.parameters()):
+        torch.testing.assert_close(own, before + config.averaged_actor_tau * (mine - before), rtol=0, atol=1e-7)
+        assert not torch.equal(own, before)
     if batch_norm:
         return
     moved = zip(agent.target_critics.parameters(), target_critics.parameters(), agent.critics.parameters())
@@ -359,6 +365,7 @@ def test_update_learns_from_terminated_and_truncated_differently():
 def test_act_samples_or_takes_the_mean():
     agent = make_agent()
     agent.fit_scaling(torch.randn(50, 3), torch.randn(50))
+    agent.update(make_batch())  # so that the averaged actor is not the actor
     observations = torch.randn(4, 3)
     torch.manual_seed(7)
     actions = torch.from_numpy(agent.act(observations.numpy(), sampled=np.array([True, False, False, True])))
@@ -407,7 +414,7 @@ def test_the_tutorials_values_are_the_defaults():
 
 def test_the_tutorials_exact_choices_are_flags():
     flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
-        --adam-beta1 0.9 --n-step 1 --no-mean-action-episodes --initial-log-alpha 0
+        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
         --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
     agent = make_agent(**TUTORIALS)
@@ -562,7 +569,7 @@ def test_train_moves_every_parameter(tiny_run):
         spaces = env.observation_space, env.action_space
     untrained = SACAgent(config, *spaces, torch.device("cpu"), common.Ranks()).state()
     trained = read_checkpoint(path)[0]["agent"]
-    for name in ("actor", "critics", "scaling"):
+    for name in ("actor", "averaged_actor", "critics", "scaling"):
         assert trained[name].keys() == untrained[name].keys()
         for key, value in trained[name].items():
             assert not torch.equal(value, untrained[name][key]) and value.isfinite().all(), (name, key)
