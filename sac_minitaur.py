@@ -72,7 +72,7 @@ class Config:
     0.005: values of a thousandth are lost in the noise of new critics"""
     reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
-    averaged_actor_tau: float = 0.001
+    averaged_actor_tau: float = 0.005
     """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update. It acts
     where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment falls"""
     mean_action_episodes: bool = True

@@ -59,9 +59,10 @@ def new_agent_and_buffer(num_threads):
     torch.set_num_threads(num_threads)
     spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
     agent = sac_minitaur.SACAgent(sac_minitaur.Config(), *spaces, torch.device("cpu"), common.Ranks())
-    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, agent.device)
+    config = agent.config
+    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, config.n_step, config.gamma, config.num_envs, agent.device)
     buffer.rows.normal_()
-    buffer.rows[:, 37] = 0  # nothing terminates
+    buffer.rows[:, 37] = config.gamma**config.n_step  # nothing terminates
     buffer.size = 100_000
     return agent, buffer
 
