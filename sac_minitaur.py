@@ -738,7 +738,8 @@ def check(config):
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
         *("checkpoint_interval", "n_step"),
     )
-    stored = min(config.initial_collect_steps - config.num_envs * (config.n_step - 1), config.replay_buffer_capacity)
+    incomplete = config.num_envs * (config.n_step - 1)
+    stored = max(0, min(config.initial_collect_steps - incomplete, config.replay_buffer_capacity))
     if config.batch_size > stored:
         raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
 

@@ -396,7 +396,7 @@ def with_nan_rewards(module):
 
 def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811
     """Stops the run at once, with the step and the part, and no checkpoint has taken it in."""
-    few = ["--initial-collect-steps", 24, "--checkpoint-interval", 1, "--eval-interval", 10**6]
+    few = ["--initial-collect-steps", 26, "--checkpoint-interval", 1, "--eval-interval", 10**6]
     run = Process(script, flags(script, tmp_path / "run", *few), tmp_path / "output", with_nan_rewards)
     assert_one_line(run, 1, "loss is nan at step ", "checkpoint is kept")
     step = int(run.stderr.split("at step ")[1].split(";")[0])
