@@ -72,14 +72,14 @@ def draw(experiment, title, threshold, names):
 
 
 def print_summary(experiments):
-    print("\n| experiment | seeds | median final return | worst final return | median at half | median episode length |")
+    print("\n| experiment | seeds | last step | median final return | worst final return | median episode length |")
     print("| --- | --- | --- | --- | --- | --- |")
     for experiment in experiments:
         evaluations = list(runs(experiment).values())
         finals = [rows[-1]["average_return"] for rows in evaluations]
         lengths = [rows[-1]["average_episode_length"] for rows in evaluations]
-        halves = [next(row["average_return"] for row in rows if row["step"] >= rows[-1]["step"] / 2) for rows in evaluations]
-        columns = f"{median(finals):.2f} | {min(finals):.2f} | {median(halves):.2f} | {median(lengths):.0f}"
+        last_step = min(rows[-1]["step"] for rows in evaluations)
+        columns = f"{last_step:.0f} | {median(finals):.2f} | {min(finals):.2f} | {median(lengths):.0f}"
         print(f"| {experiment} | {len(finals)} | {columns} |")
 
 
