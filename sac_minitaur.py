@@ -13,6 +13,7 @@ marked "ours" in `Config`, each for a reason that README gives.
 
 import copy
 import math
+import os
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -561,12 +562,6 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
     return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
 
 
-@torch.no_grad()
-def average(slow, fast, tau):
-    """Moves the parameters of one network a step τ towards those of another."""
-    torch._foreach_lerp_(list(slow.parameters()), list(fast.parameters()), tau)
-
-
 class SACAgent:
     """Actor, twin critics with their targets, and the temperature α, with their optimizers."""
 
@@ -589,6 +584,11 @@ class SACAgent:
 
         self.critic_parameters = list(self.critics.parameters())
         self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
+        # What moves, how, after every update: parameters, those that they follow, and the step τ towards these.
+        self.averages = [(list(self.averaged_actor.parameters()), self.actor_parameters[:-1], config.averaged_actor_tau)]
+        if self.target_critics:
+            targets = list(self.target_critics.parameters())
+            self.averages.append((targets, self.critic_parameters, config.target_update_tau))
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, who learn from the same sample of actions.
@@ -656,9 +656,9 @@ class SACAgent:
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
         self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
 
-        average(self.averaged_actor, self.actor, config.averaged_actor_tau)
-        if self.target_critics:
-            average(self.target_critics, self.critics, config.target_update_tau)
+        with torch.no_grad():
+            for followers, parameters, tau in self.averages:
+                torch._foreach_lerp_(followers, parameters, tau)
         return {
             "critic_loss": loss_q.detach(),
             "actor_loss": loss_pi.detach(),
@@ -738,7 +738,8 @@ def check(config):
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
         *("checkpoint_interval", "n_step"),
     )
-    incomplete = config.num_envs * (config.n_step - 1)
+    # Every environment of every process holds back its last steps.
+    incomplete = config.num_envs * (config.n_step - 1) * int(os.environ.get("WORLD_SIZE", 1))
     stored = max(0, min(config.initial_collect_steps - incomplete, config.replay_buffer_capacity))
     if config.batch_size > stored:
         raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")

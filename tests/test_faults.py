@@ -99,8 +99,6 @@ def change_config(path, **values):
     torch.save(state, path)
 
 
-
-
 @pytest.fixture
 def copy(reference, tmp_path):  # noqa: F811
     """A finished run, to be damaged."""

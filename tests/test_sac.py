@@ -204,8 +204,9 @@ CPU = torch.device("cpu")
 def numbered(first, count):
     """Steps of one environment (2 observations, 1 action) whose numbers tell where they belong: 0 to 3 are an episode
     that ends, 4 to 6 one that its time limit ends, 7 the beginning of a third."""
-    for n in np.arange(first, first + count, dtype=np.float32):
-        yield np.array([[n, n + 0.1]]), np.array([[n + 0.2]]), 10**n[None], n[None] == 3, n[None] == 6, np.array([[n + 0.4, n]])
+    for n in np.arange(first, first + count, dtype=np.float32)[:, None]:
+        observations, next_observations = np.stack((n, n + 0.1), 1), np.stack((n + 0.4, n), 1)
+        yield observations, n[:, None] + 0.2, 10**n, n == 3, n == 6, next_observations
 
 
 def filled(buffer, first, count):
@@ -250,21 +251,25 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     n = observations[:, 0]
     assert set(n.tolist()) == {0, 1, 2}
     assert observations.shape == next_observations.shape == (200, 2) and actions.shape == (200, 1)
-    assert returns.shape == discounts.shape == (200,)
+    assert returns.shape == (200,)
+    torch.testing.assert_close(observations[:, 1], n + 0.1)
     torch.testing.assert_close(actions[:, 0], n + 0.2)
     torch.testing.assert_close(returns, 10**n)
+    assert torch.equal(discounts, torch.full((200,), 0.5))
     torch.testing.assert_close(next_observations, torch.stack((n + 0.4, n), 1))
 
     filled(buffer, 3, 4)  # across the end
     assert buffer.size == 5 and buffer.position == 2
     counts = buffer.sample(5000)[0][:, 0].long().bincount()
     assert counts[:2].tolist() == [0, 0] and counts[2:].min() > 850 and len(counts) == 7
+    pairs = zip(*(column.tolist() for column in buffer.sample(200)[2:4]))
+    assert set(pairs) == {(100, 0.5), (1000, 0), (1e4, 0.5), (1e5, 0.5), (1e6, 0.5)}
     observations, returns = buffer.observations_and_returns()
     assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and returns.shape == (5,)
 
 
-@pytest.mark.parametrize("stored", [3, 8])
-def test_replay_buffer_goes_on_from_its_state(stored):
+@pytest.mark.parametrize("stored, position", [(3, 2), (8, 0)])
+def test_replay_buffer_goes_on_from_its_state(stored, position):
     buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
     other = ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU)
     state = buffer.state()
@@ -272,7 +277,7 @@ def test_replay_buffer_goes_on_from_its_state(stored):
     for each in (buffer, other):
         filled(each, stored, 4)
     assert torch.equal(other.rows, buffer.rows) and buffer.size == other.size == 5
-    assert other.position == buffer.position
+    assert other.position == buffer.position == position
     assert len(state["rows"]) == min(stored - 2, 5)  # a copy: what was added later is not in it
     assert state["rows"][:, 0].max() < stored
 
@@ -295,7 +300,6 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
             for parameter in agent.target_critics.parameters():  # else they would equal the critics
                 parameter += 0.05 * torch.randn_like(parameter)
     actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
-
     averaged = [parameter.clone() for parameter in agent.averaged_actor.parameters()]
 
     def adam_step(parameters, gradients, learning_rate):
