@@ -41,16 +41,16 @@ def tutorials():
 def print_table(experiment):
     print(f"\n### {experiment}\n\n| seed | final return | episode length | best evaluation | worst after half |")
     print("| --- | --- | --- | --- | --- |")
-    finals = []
+    summary = []
     for seed, rows in runs(experiment).items():
         last = rows[-1]
         best = max(row["average_return"] for row in rows)
         late = min(row["average_return"] for row in rows if row["step"] >= last["step"] / 2)
-        finals.append((last["average_return"], last["average_episode_length"]))
+        summary.append((last["average_return"], last["average_episode_length"], best, late))
         spread = f"{last['average_return']:.2f} ± {last['std_return']:.2f}"
         print(f"| {seed[4:]} | {spread} | {last['average_episode_length']:.0f} | {best:.2f} | {late:.2f} |")
-    returns, lengths = zip(*finals)
-    print(f"| median | {median(returns):.2f} | {median(lengths):.0f} | | |")
+    for name, pick in (("median", median), ("worst", min)):
+        print(f"| {name} | {{:.2f}} | {{:.0f}} | {{:.2f}} | {{:.2f}} |".format(*map(pick, zip(*summary))))
 
 
 def draw(experiment, title, threshold, names):
@@ -71,23 +71,10 @@ def draw(experiment, title, threshold, names):
     figure.savefig(RESULTS / f"{experiment}.png", dpi=110)
 
 
-def print_summary(experiments):
-    print("\n| experiment | seeds | last step | median final return | worst final return | median episode length |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for experiment in experiments:
-        evaluations = list(runs(experiment).values())
-        finals = [rows[-1]["average_return"] for rows in evaluations]
-        lengths = [rows[-1]["average_episode_length"] for rows in evaluations]
-        last_step = min(rows[-1]["step"] for rows in evaluations)
-        columns = f"{last_step:.0f} | {median(finals):.2f} | {min(finals):.2f} | {median(lengths):.0f}"
-        print(f"| {experiment} | {len(finals)} | {columns} |")
-
-
 def main():
     experiments = sorted(path.name for path in RESULTS.iterdir() if path.is_dir())
     for experiment in experiments:
         print_table(experiment)
-    print_summary(experiments)
     for experiment, figure in FIGURES.items():
         draw(experiment, *figure)
 
