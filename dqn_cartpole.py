@@ -11,7 +11,8 @@ through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Ever
 those marked "ours" in `Config`. The tutorial discounts by 1 and bootstraps from the network of the step before, so
 that nothing bounds its values: its losses reach 1e10, and those who trained on saw the return fall back to 12 to 32.
 Here values are discounted and start from what an endless episode is worth, so that only falling and leaving the track
-have to be learned; they are bounded by it; a target network follows slowly; and the learning rate decays.
+have to be learned; they are bounded by it; a target network follows slowly; the values of the two actions, nearly
+equal after so short a step, are pushed apart; and the learning rate decays.
 """
 
 import math
@@ -66,6 +67,9 @@ class Config:
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
     value_bound: bool = True
     """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth for ever"""
+    advantage_learning: float = 0.5
+    """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one. The other action
+    comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's errors"""
     layers: tuple[int, ...] = (100, 50)
     """hidden units of the Q-network"""
 
@@ -221,6 +225,15 @@ def td_targets(rewards, terminated, next_q, next_actions, gamma, bound=math.inf)
     return (rewards + gamma * (1 - terminated) * next_value).clamp(max=bound)
 
 
+def action_gap(q, actions):
+    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,).
+
+    Advantage learning (Baird's; arXiv:1512.04860) takes a part of it off the target: the best action keeps its value,
+    and the others' come to lie 1 / (1 − part) times as far below it.
+    """
+    return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
+
+
 def td_loss(q, targets):
     """The mean squared error: q (B,), targets (B,)."""
     return F.mse_loss(q, targets)
@@ -283,8 +296,10 @@ class DQNAgent:
 
         with torch.no_grad():
             next_actions = self.q_network(next_observations).argmax(1)
-            next_q = self.value_offset + self.target_network(next_observations)
+            both = torch.cat((observations, next_observations))
+            target_q, next_q = (self.value_offset + self.target_network(both)).chunk(2)
             targets = td_targets(rewards, terminated, next_q, next_actions, config.gamma, bound)
+            targets -= config.advantage_learning * action_gap(target_q, actions)
         q = self.value_offset + self.q_network(observations).gather(1, actions[:, None]).squeeze(1)
         loss = td_loss(q, targets)
         self.optimizer.zero_grad()
@@ -361,6 +376,8 @@ def check(config):
     collected = min(config.initial_collect_steps, config.replay_buffer_capacity)
     if config.batch_size > collected:
         raise InputError(f"--batch-size {config.batch_size} is more than the {collected} transitions collected first")
+    if not 0 <= config.advantage_learning < 1:
+        raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
     if (config.value_offset or config.value_bound) and config.gamma >= 1:
         raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1")
 

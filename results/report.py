@@ -5,6 +5,7 @@ TF-Agents tutorials print.
 """
 
 import csv
+import math
 from pathlib import Path
 from statistics import median
 
@@ -38,19 +39,31 @@ def tutorials():
     return curves
 
 
-def print_table(experiment):
-    print(f"\n### {experiment}\n\n| seed | final return | episode length | best evaluation | worst after half |")
-    print("| --- | --- | --- | --- | --- |")
+def print_table(experiment, goal, late):
+    """One row for each seed: `goal` is the return to reach, `late` the step from which the worst evaluation counts."""
+    print(f"\n### {experiment}\n\n| seed | final return | episode length | best | worst from {late} on | first ≥ {goal} |")
+    print("| --- | --- | --- | --- | --- | --- |")
     summary = []
     for seed, rows in runs(experiment).items():
-        last = rows[-1]
-        best = max(row["average_return"] for row in rows)
-        late = min(row["average_return"] for row in rows if row["step"] >= last["step"] / 2)
-        summary.append((last["average_return"], last["average_episode_length"], best, late))
+        last, best = rows[-1], max(row["average_return"] for row in rows)
+        worst = min((row["average_return"] for row in rows if row["step"] >= late), default=math.nan)
+        first = next((row["step"] for row in rows if row["average_return"] >= goal), math.inf)
+        summary.append((last["average_return"], last["average_episode_length"], best, worst, first))
         spread = f"{last['average_return']:.2f} ± {last['std_return']:.2f}"
-        print(f"| {seed[4:]} | {spread} | {last['average_episode_length']:.0f} | {best:.2f} | {late:.2f} |")
-    for name, pick in (("median", median), ("worst", min)):
-        print(f"| {name} | {{:.2f}} | {{:.0f}} | {{:.2f}} | {{:.2f}} |".format(*map(pick, zip(*summary))))
+        print(f"| {seed[4:]} | {spread} | {last['average_episode_length']:.0f} | {best:.2f} | {worst:.2f} | {first:.0f} |")
+    middle = [median(column) for column in zip(*summary)]
+    print("| median | {:.2f} | {:.0f} | {:.2f} | {:.2f} | {:.0f} |".format(*middle))
+
+
+def print_ablation(experiment, step):
+    """Returns after `step` updates of `<experiment>` and of all `<experiment>_without_…`, with the seeds that these ran."""
+    names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
+    seeds = sorted(set().union(*map(runs, names)))
+    print(f"\n### Without one choice, at {step}\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
+    for name in (experiment, *names):
+        returns = [row["average_return"] for seed in seeds for row in runs(name)[seed] if row["step"] == step]
+        columns = " | ".join(f"{value:.2f}" for value in (*returns, median(returns)))
+        print(f"| {name.removeprefix(experiment).removeprefix('_without_') or '–'} | {columns} |")
 
 
 def draw(experiment, title, threshold, names):
@@ -72,9 +85,12 @@ def draw(experiment, title, threshold, names):
 
 
 def main():
-    experiments = sorted(path.name for path in RESULTS.iterdir() if path.is_dir())
-    for experiment in experiments:
-        print_table(experiment)
+    for path in sorted(RESULTS.glob("sac*")):
+        if path.is_dir() and "_without_" not in path.name:
+            print_table(path.name, goal=15, late=50_000)
+    print_ablation("sac_minitaur", step=30_000)
+    for experiment, goal in (("dqn_cartpole", 200), ("dqn_cartpole_130000", 200), ("dqn_cartpole_v1", 475)):
+        print_table(experiment, goal, late=10_000)
     for experiment, figure in FIGURES.items():
         draw(experiment, *figure)
 

@@ -103,6 +103,21 @@ def test_terminated_and_truncated_give_different_targets():
     assert dqn_cartpole.td_targets(*arguments, gamma=0.9).tolist() == pytest.approx([46.0, 1.0])
 
 
+def test_action_gap():
+    gap = dqn_cartpole.action_gap(torch.tensor([[3.0, 1.0, 2.0], [3.0, 1.0, 2.0]]), torch.tensor([0, 1]))
+    assert gap.tolist() == [0.0, 2.0]
+
+
+def test_advantage_learning_pushes_values_apart():
+    """Rewards 1 and 0, then the end: the best action stays worth 1, the other falls from 0 to 1 − 1 / (1 − 0.5)."""
+    torch.manual_seed(0)
+    agent = make_agent(learning_rate=1e-2, target_update_tau=0.1, advantage_learning=0.5)
+    actions = torch.arange(16) % 2
+    for _ in range(400):
+        agent.update((torch.ones(16, 4), actions, 1.0 - actions, torch.ones(16), torch.ones(16, 4)), 1.0)
+    assert agent.q_network(torch.ones(4)).tolist() == pytest.approx([1, -1], abs=0.02)
+
+
 def test_loss_by_hand():
     q, targets = torch.tensor([1.0, 5.0, 0.0]), torch.tensor([1.5, 2.0, 0.0])
     assert dqn_cartpole.td_loss(q, targets).item() == pytest.approx((0.5**2 + 3**2 + 0) / 3)
@@ -234,7 +249,9 @@ def test_update_is_double_dqn():
         assert (own.argmax(1) != target.argmax(1)).any()
         value = torch.where(own[:, 0] > own[:, 1], target[:, 0], target[:, 1])
         q = torch.where(actions == 0, *agent.q_network(observations).unbind(1))
-        error = rewards + 0.9 * (1 - terminated) * value - q
+        here, other = agent.target_network(observations), agent.target_network(observations).flip(1)
+        gap = torch.where(actions == 0, *(other - here).clamp(min=0).unbind(1))
+        error = rewards + 0.9 * (1 - terminated) * value - agent.config.advantage_learning * gap - q
     metrics = agent.update(batch, 1.0)
     torch.testing.assert_close(metrics["loss"], error.square().mean())
     torch.testing.assert_close(metrics["mean_q"], q.mean())
@@ -415,6 +432,7 @@ def test_imports_without_pybullet():
         ("--num-iterations -5", "num-iterations"),
         ("--num-envs 0", "num-envs"),
         ("--gamma 1", "gamma"),
+        ("--advantage-learning 1", "--advantage-learning"),
         ("--run-dir .", "not empty"),
         ("--resume nowhere", "nowhere"),
         ("--evaluate nowhere.pt2", "nowhere.pt2"),
