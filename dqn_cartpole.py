@@ -53,7 +53,7 @@ class Config:
 
     learning_rate: float = 1e-3
     """Adam's, at the start"""
-    learning_rate_decay: int = 2_000
+    learning_rate_decay: int = 6_000
     """ours (theirs: none): after this many updates the learning rate is half, after n times as many 1 / (1 + n)"""
     adam_epsilon: float = 1e-7
     """Adam's ε (Keras' default, which the tutorial leaves unsaid)"""
@@ -67,7 +67,7 @@ class Config:
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
     value_bound: bool = True
     """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth for ever"""
-    advantage_learning: float = 0.5
+    advantage_learning: float = 0.7
     """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one. The other action
     comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's errors"""
     layers: tuple[int, ...] = (100, 50)

@@ -39,6 +39,10 @@ def tutorials():
     return curves
 
 
+def number(value, digits=2):
+    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
+
+
 def print_table(experiment, goal, late):
     """One row for each seed: `goal` is the return to reach, `late` the step from which the worst evaluation counts."""
     print(f"\n### {experiment}\n\n| seed | final return | episode length | best | worst from {late} on | first ≥ {goal} |")
@@ -50,9 +54,9 @@ def print_table(experiment, goal, late):
         first = next((row["step"] for row in rows if row["average_return"] >= goal), math.inf)
         summary.append((last["average_return"], last["average_episode_length"], best, worst, first))
         spread = f"{last['average_return']:.2f} ± {last['std_return']:.2f}"
-        print(f"| {seed[4:]} | {spread} | {last['average_episode_length']:.0f} | {best:.2f} | {worst:.2f} | {first:.0f} |")
-    middle = [median(column) for column in zip(*summary)]
-    print("| median | {:.2f} | {:.0f} | {:.2f} | {:.2f} | {:.0f} |".format(*middle))
+        print(f"| {seed[4:]} | {spread} | {summary[-1][1]:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
+    medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 0, 2, 2, 0)))
+    print(f"| median | {' | '.join(medians)} |")
 
 
 def print_ablation(experiment, step):
