@@ -63,11 +63,12 @@ def print_ablation(experiment, step):
     """Returns after `step` updates of `<experiment>` and of all `<experiment>_without_…`, with the seeds that these ran."""
     names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
     seeds = sorted(set().union(*map(runs, names)))
-    print(f"\n### Without one choice, at {step}\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
+    print(f"\n### At {step}, without one choice\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
     for name in (experiment, *names):
-        returns = [row["average_return"] for seed in seeds for row in runs(name)[seed] if row["step"] == step]
-        columns = " | ".join(f"{value:.2f}" for value in (*returns, median(returns)))
-        print(f"| {name.removeprefix(experiment).removeprefix('_without_') or '–'} | {columns} |")
+        at = {seed: row["average_return"] for seed, rows in runs(name).items() for row in rows if row["step"] == step}
+        returns = [at[seed] for seed in seeds if seed in at]
+        choice = name.removeprefix(experiment).removeprefix("_without_") or "nothing"
+        print(f"| {choice} | {' | '.join(number(at.get(seed, math.nan)) for seed in seeds)} | {median(returns):.2f} |")
 
 
 def draw(experiment, title, threshold, names):
