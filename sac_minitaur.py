@@ -584,7 +584,7 @@ class SACAgent:
 
         self.critic_parameters = list(self.critics.parameters())
         self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
-        # What moves, how, after every update: parameters, those that they follow, and the step τ towards these.
+        # After every update the first parameters of each move a step τ, the third, towards the second.
         self.averages = [(list(self.averaged_actor.parameters()), self.actor_parameters[:-1], config.averaged_actor_tau)]
         if self.target_critics:
             targets = list(self.target_critics.parameters())

@@ -49,12 +49,13 @@ def print_table(experiment, goal, late):
     print("| --- | --- | --- | --- | --- | --- |")
     summary = []
     for seed, rows in runs(experiment).items():
-        last, best = rows[-1], max(row["average_return"] for row in rows)
+        final, length = rows[-1]["average_return"], rows[-1]["average_episode_length"]
+        best = max(row["average_return"] for row in rows)
         worst = min((row["average_return"] for row in rows if row["step"] >= late), default=math.nan)
         first = next((row["step"] for row in rows if row["average_return"] >= goal), math.inf)
-        summary.append((last["average_return"], last["average_episode_length"], best, worst, first))
-        spread = f"{last['average_return']:.2f} ± {last['std_return']:.2f}"
-        print(f"| {seed[4:]} | {spread} | {summary[-1][1]:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
+        summary.append((final, length, best, worst, first))
+        spread = f"{final:.2f} ± {rows[-1]['std_return']:.2f}"
+        print(f"| {seed[4:]} | {spread} | {length:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
     medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 0, 2, 2, 0)))
     print(f"| median | {' | '.join(medians)} |")
 
@@ -62,10 +63,11 @@ def print_table(experiment, goal, late):
 def print_ablation(experiment, step):
     """Returns after `step` updates of `<experiment>` and of all `<experiment>_without_…`, with the seeds that these ran."""
     names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
-    seeds = sorted(set().union(*map(runs, names)))
+    curves = {name: runs(name) for name in (experiment, *names)}
+    seeds = sorted(set().union(*(curves[name] for name in names)))
     print(f"\n### At {step}, without one choice\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
-    for name in (experiment, *names):
-        at = {seed: row["average_return"] for seed, rows in runs(name).items() for row in rows if row["step"] == step}
+    for name, evaluations in curves.items():
+        at = {seed: row["average_return"] for seed, rows in evaluations.items() for row in rows if row["step"] == step}
         returns = [at[seed] for seed in seeds if seed in at]
         choice = name.removeprefix(experiment).removeprefix("_without_") or "nothing"
         print(f"| {choice} | {' | '.join(number(at.get(seed, math.nan)) for seed in seeds)} | {median(returns):.2f} |")
