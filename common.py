@@ -63,6 +63,24 @@ def require_positive(config, *names):
             raise InputError(f"--{name.replace('_', '-')} {getattr(config, name)} is too small: use 1 or more")
 
 
+def num_processes():
+    """How many processes torchrun started, this one among them; 1 without torchrun."""
+    return int(os.environ.get("WORLD_SIZE", 1)) if "RANK" in os.environ else 1
+
+
+def require_batch(config, held_back=0):
+    """Raises InputError for a batch that the processes cannot share, or that the first random data do not fill.
+
+    Of these, every process has yet to store its last `held_back` steps.
+    """
+    processes = num_processes()
+    if config.batch_size % processes:
+        raise InputError(f"--batch-size {config.batch_size} cannot be shared by {processes} processes")
+    stored = max(0, min(config.initial_collect_steps - processes * held_back, config.replay_buffer_capacity))
+    if config.batch_size > stored:
+        raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
+
+
 def run_main(main):
     """Calls `main` and turns an `InputError` or a `RunError` into one line on stderr and an exit status."""
     try:
@@ -156,7 +174,7 @@ class Ranks:
     @classmethod
     def join(cls):
         """Joins the process group that torchrun's environment variables describe."""
-        if "WORLD_SIZE" not in os.environ or "RANK" not in os.environ:
+        if num_processes() == 1:
             return cls()
         if not dist.is_initialized():
             dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
@@ -461,8 +479,6 @@ class Run:
         self.config, self.script = config, script
         self.ranks = Ranks.join()
         self.writes = self.ranks.rank == 0
-        if config.batch_size % self.ranks.world_size:
-            raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.ranks.world_size} processes")
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
         self.device = select_device(config.device, self.ranks.local_rank)

@@ -373,9 +373,7 @@ def check(config):
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
         *("checkpoint_interval", "learning_rate_decay"),
     )
-    collected = min(config.initial_collect_steps, config.replay_buffer_capacity)
-    if config.batch_size > collected:
-        raise InputError(f"--batch-size {config.batch_size} is more than the {collected} transitions collected first")
+    common.require_batch(config)
     if not 0 <= config.advantage_learning < 1:
         raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
     if (config.value_offset or config.value_bound) and config.gamma >= 1:

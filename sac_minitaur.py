@@ -13,7 +13,6 @@ marked "ours" in `Config`, each for a reason that README gives.
 
 import copy
 import math
-import os
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -738,11 +737,8 @@ def check(config):
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
         *("checkpoint_interval", "n_step"),
     )
-    # Every environment of every process holds back its last steps.
-    incomplete = config.num_envs * (config.n_step - 1) * int(os.environ.get("WORLD_SIZE", 1))
-    stored = max(0, min(config.initial_collect_steps - incomplete, config.replay_buffer_capacity))
-    if config.batch_size > stored:
-        raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
+    # Every environment's last transitions are not complete yet.
+    common.require_batch(config, held_back=config.num_envs * (config.n_step - 1))
 
 
 def train(config):
