@@ -115,7 +115,7 @@ def test_advantage_learning_pushes_values_apart():
     actions = torch.arange(16) % 2
     for _ in range(400):
         agent.update((torch.ones(16, 4), actions, 1.0 - actions, torch.ones(16), torch.ones(16, 4)), 1.0)
-    assert agent.q_network(torch.ones(4)).tolist() == pytest.approx([1, -1], abs=0.02)
+    assert agent.q_network(agent.scaling(torch.ones(4))).tolist() == pytest.approx([1, -1], abs=0.02)
 
 
 def test_loss_by_hand():
@@ -124,6 +124,18 @@ def test_loss_by_hand():
 
 
 # The network
+
+
+def test_scaling_maps_bounds_to_one():
+    """From [2, 6] and [-4, 4]; without bounds, with those that float32 cannot subtract, or without width: as they are."""
+    huge = np.finfo(np.float32).max
+    low, high = np.float32([[2, -4], [-np.inf, 0], [-huge, 5]]), np.float32([[6, 4], [np.inf, np.inf], [huge, 5]])
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(low, high))
+    observations = torch.tensor([[2.0, -4, 3, 3, 3, 5], [6, 4, -7, -7, -7, 5], [4, 1, 0, 0, 0, 5]])
+    scaled = [[-1.0, -1, 3, 3, 3, 5], [1, 1, -7, -7, -7, 5], [0, 0.25, 0, 0, 0, 5]]
+    assert scaling(observations).tolist() == scaled
+    unscaled = make_agent(observation_scaling=False)
+    assert torch.equal(unscaled.scaling(observations), observations)
 
 
 def test_initialization():
@@ -244,6 +256,7 @@ def test_update_is_double_dqn():
     agent = make_agent(gamma=0.9)
     agent.target_network.load_state_dict(QNetwork(4, 2, TINY.layers).state_dict())
     observations, actions, rewards, terminated, next_observations = batch = random_batch(64)
+    observations, next_observations = agent.scaling(observations), agent.scaling(next_observations)
     with torch.no_grad():
         own, target = agent.q_network(next_observations), agent.target_network(next_observations)
         assert (own.argmax(1) != target.argmax(1)).any()
@@ -267,7 +280,8 @@ def test_learns_values_of_a_known_chain():
         batch = observations, actions, torch.ones(16), torch.full((16,), terminated), observations
         for _ in range(400):
             agent.update(batch, 1.0)
-        assert agent.q_network(torch.ones(4)).tolist() == pytest.approx([value, value], abs=0.02)
+        q = agent.q_network(agent.scaling(torch.ones(4)))
+        assert q.tolist() == pytest.approx([value, value], abs=0.02)
 
 
 def test_offset_is_added_to_both_networks():
@@ -293,7 +307,7 @@ def test_policy_is_greedy():
     observations = torch.randn(50, 4)
     actions = agent.policy(observations)
     assert actions.shape == (50,) and set(actions.tolist()) == {0, 1}
-    assert (actions == agent.policy.q_network(observations).argmax(1)).all()
+    assert (actions == agent.q_network(agent.scaling(observations)).argmax(1)).all()
 
 
 def test_state_continues_exactly():
