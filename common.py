@@ -63,11 +63,6 @@ def require_positive(config, *names):
             raise InputError(f"--{name.replace('_', '-')} {getattr(config, name)} is too small: use 1 or more")
 
 
-def num_processes():
-    """How many processes torchrun started, this one among them; 1 without torchrun."""
-    return int(os.environ.get("WORLD_SIZE", 1)) if "RANK" in os.environ else 1
-
-
 def require_batch(config, held_back=0):
     """Raises InputError for a batch that the processes cannot share, or that the first random data do not fill.
 
@@ -150,6 +145,11 @@ def episode_seed(*key):
 
 
 # Several processes training together
+
+
+def num_processes():
+    """How many processes torchrun started, this one among them; 1 without torchrun."""
+    return int(os.environ.get("WORLD_SIZE", 1)) if "RANK" in os.environ else 1
 
 
 class _Mean(torch.autograd.Function):
