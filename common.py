@@ -71,7 +71,8 @@ def require_batch(config, held_back=0):
     processes = num_processes()
     if config.batch_size % processes:
         raise InputError(f"--batch-size {config.batch_size} cannot be shared by {processes} processes")
-    stored = max(0, min(config.initial_collect_steps - processes * held_back, config.replay_buffer_capacity))
+    own = min(config.initial_collect_steps // processes - held_back, config.replay_buffer_capacity)
+    stored = max(0, processes * own)
     if config.batch_size > stored:
         raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
 
@@ -782,8 +783,12 @@ def resumed_config(config, parse):
     path = Path(config.resume) / "config.json"
     try:
         saved = json.loads(path.read_text())
+        fields = dataclasses.fields(config)
+        missing = [field.name for field in fields if field.name not in saved]
+        if missing:  # another version of the script wrote it: today's default need not be what it did
+            raise ValueError(f"it has no {missing[0]}")
         saved = type(config)(**{key: tuple(v) if isinstance(v, list) else v for key, v in saved.items()})
-        for field in dataclasses.fields(saved):
+        for field in fields:
             value = getattr(saved, field.name)
             if not isinstance(value, tuple | field.type) and not (field.type is float and isinstance(value, int)):
                 raise TypeError(f"{field.name} is {value!r}")
@@ -792,7 +797,7 @@ def resumed_config(config, parse):
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is not the config of a run of this script ({first_line(error)})") from None
     config = parse(dataclasses.replace(saved, resume=config.resume))
-    for field in dataclasses.fields(config):
+    for field in fields:
         old, new = getattr(saved, field.name), getattr(config, field.name)
         flag = "--" + field.name.replace("_", "-")
         if field.name == "num_iterations" and new < old:

@@ -122,7 +122,9 @@ def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
 
 def test_damaged_config(script, copy, tmp_path):  # noqa: F811
     config = json.loads((copy / "config.json").read_text())
-    texts = "", "[1, 2]", json.dumps(config | {"wings": 2}), json.dumps(config | {"num_iterations": "many"})
+    older = {name: value for name, value in config.items() if name != "observation_scaling"}
+    changed = older, config | {"wings": 2}, config | {"num_iterations": "many"}
+    texts = "", "[1, 2]", *map(json.dumps, changed)
     config_type = importlib.import_module(script).Config
     for text in texts:
         (copy / "config.json").write_text(text)
