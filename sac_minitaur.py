@@ -88,7 +88,7 @@ class Config:
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
     """ours, and the paper's −|A| (TF-Agents' default, which the tutorials leave unsaid: −|A|/2, so −0.5)"""
-    initial_log_alpha: float = -2.0
+    initial_log_alpha: float = -3.0
     """ours (TF-Agents' default, which the tutorials leave unsaid: 0)"""
     actor_layers: tuple[int, ...] = (256, 256)
     """hidden units of the actor"""
