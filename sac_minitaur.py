@@ -65,7 +65,7 @@ class Config:
     the error of one critic; half of it averages out"""
     policy_delay: int = 2
     """ours (theirs: 1): updates of the critics per update of the actor and α, as in TD3 (arXiv:1802.09477) and CrossQ:
-    a sixth faster, and the actor learns no less"""
+    a sixth less work for the whole job"""
     target_update_tau: float = 0.005
     """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
