@@ -60,12 +60,6 @@ class Config:
     critic_batch_norm: bool = True
     """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
     (arXiv:1902.05605): what is learned is then worth something a step later, not a fifth of the run"""
-    actor_mean_q: bool = True
-    """ours (theirs: the minimum): the actor climbs the mean of the twins' Q. What an action of 0.01 s is worth drowns in
-    the error of one critic; half of it averages out"""
-    policy_delay: int = 2
-    """ours (theirs: 1): updates of the critics per update of the actor and α, as in TD3 (arXiv:1802.09477) and CrossQ:
-    a sixth less work for the whole job"""
     target_update_tau: float = 0.005
     """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
@@ -79,7 +73,7 @@ class Config:
     reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
     averaged_actor_tau: float = 0.005
-    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, whenever that has moved. It acts
+    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update. It acts
     where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment falls"""
     mean_action_episodes: bool = True
     """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean
@@ -88,7 +82,7 @@ class Config:
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
     """ours, and the paper's −|A| (TF-Agents' default, which the tutorials leave unsaid: −|A|/2, so −0.5)"""
-    initial_log_alpha: float = -3.0
+    initial_log_alpha: float = -2.0
     """ours (TF-Agents' default, which the tutorials leave unsaid: 0)"""
     actor_layers: tuple[int, ...] = (256, 256)
     """hidden units of the actor"""
@@ -555,8 +549,8 @@ def critic_loss(q, targets, weight):
 
 
 def actor_loss(log_probs, q, alpha):
-    """The mean of α log π(a|s) − Q(s, a): log_probs (B,), q (B,). Equation 7."""
-    return (alpha * log_probs - q).mean()
+    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). Equation 7."""
+    return (alpha * log_probs - q.amin(0)).mean()
 
 
 def alpha_loss(log_alpha, log_probs, target_entropy):
@@ -589,8 +583,11 @@ class SACAgent:
 
         self.critic_parameters = list(self.critics.parameters())
         self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
-        self.averaged_parameters = list(self.averaged_actor.parameters())
-        self.target_parameters = list(self.target_critics.parameters()) if self.target_critics else []
+        # After every update the first parameters of each move a step τ, the third, towards the second.
+        self.averages = [(list(self.averaged_actor.parameters()), self.actor_parameters[:-1], config.averaged_actor_tau)]
+        if self.target_critics:
+            targets = list(self.target_critics.parameters())
+            self.averages.append((targets, self.critic_parameters, config.target_update_tau))
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, who learn from the same sample of actions.
@@ -599,7 +596,6 @@ class SACAgent:
             {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
         ]
         self.actor_optimizer = torch.optim.Adam(groups, **adam)
-        self.updates, self.metrics = 0, {}
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
@@ -627,11 +623,10 @@ class SACAgent:
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
-        """One gradient step of the critics; every `policy_delay`-th time, from the first on, one of the actor and α.
+        """One gradient step of the critics, then of the actor and α, then of what follows them slowly.
 
-        What follows them slowly moves after them. `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to
-        log, each from when it was last computed, as tensors on the device: reading a number back here would make a GPU
-        wait at every step.
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
+        number back here would make a GPU wait at every step.
         """
         config = self.config
         observations, actions, returns, discounts, next_observations = batch
@@ -654,23 +649,23 @@ class SACAgent:
             targets = td_targets(returns, discounts, next_q, next_log_probs, alpha)
         loss_q = critic_loss(q, targets, config.critic_loss_weight)
         self._step(self.critic_optimizer, loss_q, self.critic_parameters)
-        self.metrics = self.metrics | {"critic_loss": loss_q.detach(), "mean_q": q.detach().mean(), "alpha": alpha}
-        if self.target_critics:
-            with torch.no_grad():
-                torch._foreach_lerp_(self.target_parameters, self.critic_parameters, config.target_update_tau)
 
-        if self.updates % config.policy_delay == 0:
-            new_actions, log_probs = self.actor.sample(observations)
-            q = self.critics(observations, new_actions)
-            loss_pi = actor_loss(log_probs, q.mean(0) if config.actor_mean_q else q.amin(0), alpha)
-            loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-            self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
-            with torch.no_grad():
-                torch._foreach_lerp_(self.averaged_parameters, self.actor_parameters[:-1], config.averaged_actor_tau)
-            entropy = -log_probs.detach().mean()
-            self.metrics |= {"actor_loss": loss_pi.detach(), "alpha_loss": loss_alpha.detach(), "entropy": entropy}
-        self.updates += 1
-        return self.metrics
+        new_actions, log_probs = self.actor.sample(observations)
+        loss_pi = actor_loss(log_probs, self.critics(observations, new_actions), alpha)
+        loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
+        self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
+
+        with torch.no_grad():
+            for followers, parameters, tau in self.averages:
+                torch._foreach_lerp_(followers, parameters, tau)
+        return {
+            "critic_loss": loss_q.detach(),
+            "actor_loss": loss_pi.detach(),
+            "alpha_loss": loss_alpha.detach(),
+            "alpha": alpha,
+            "entropy": -log_probs.detach().mean(),
+            "mean_q": q.detach().mean(),
+        }
 
     def _step(self, optimizer, loss, parameters):
         optimizer.zero_grad()
@@ -689,8 +684,6 @@ class SACAgent:
             "reward_scale": self.reward_scale,
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "actor_optimizer": self.actor_optimizer.state_dict(),
-            "updates": self.updates,
-            "metrics": self.metrics,
         }
         return state | ({"target_critics": self.target_critics.state_dict()} if self.target_critics else {})
 
@@ -699,10 +692,8 @@ class SACAgent:
             own = getattr(self, name)
             if isinstance(own, torch.Tensor):
                 own.detach().copy_(saved)
-            elif hasattr(own, "load_state_dict"):
-                own.load_state_dict(saved)
             else:
-                setattr(self, name, saved)
+                own.load_state_dict(saved)
 
 
 # Evaluation
@@ -744,7 +735,7 @@ def check(config):
         config,
         *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
         *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
-        *("checkpoint_interval", "n_step", "policy_delay"),
+        *("checkpoint_interval", "n_step"),
     )
     # Every environment's last transitions are not complete yet.
     common.require_batch(config, held_back=config.num_envs * (config.n_step - 1))

@@ -66,7 +66,7 @@ def print_ablation(experiment, step):
     names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
     curves = {name: runs(name) for name in (experiment, *names)}
     seeds = sorted(set().union(*(curves[name] for name in names)))
-    print(f"\n### {experiment} at {step}, without one choice\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
+    print(f"\n### At {step}, without one choice\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
     for name, evaluations in curves.items():
         at = {seed: row["average_return"] for seed, rows in evaluations.items() for row in rows if row["step"] == step}
         returns = [at[seed] for seed in seeds if seed in at]
@@ -96,7 +96,7 @@ def main():
     for path in sorted(RESULTS.glob("sac*")):
         if path.is_dir() and "_without_" not in path.name:
             print_table(path.name, goal=15, late=50_000)
-    print_ablation("sac_minimum_q", step=30_000)
+    print_ablation("sac_minitaur", step=30_000)
     for experiment, goal in (
         ("dqn_cartpole", 200),
         ("dqn_cartpole_130000", 200),
