@@ -30,6 +30,8 @@ TUTORIALS = dict(
     n_step=1,
     averaged_actor_tau=1.0,
     mean_action_episodes=False,
+    mirroring=False,
+    bfloat16_products=False,
     initial_log_alpha=0.0,
     target_entropy_per_action=-0.5,
     reward_scale_factor=1.0,
@@ -268,6 +270,25 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and returns.shape == (5,)
 
 
+def test_replay_buffer_shows_half_of_its_transitions_in_a_mirror():
+    mirror = (([1, 0], [-1, 1]), ([0], [-1]))
+    buffer = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU, mirror), 0, 3)
+    plain = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU), 0, 3)
+    assert torch.equal(buffer.rows[:3], plain.rows[:3])
+    torch.manual_seed(0)
+    observations, actions, returns, discounts, next_observations = buffer.sample(400)
+    n = returns.log10().round()
+    torch.testing.assert_close(returns, 10**n)
+    assert (discounts == 0.5).all()
+    mirrored = actions[:, 0] < 0
+    assert 150 < mirrored.sum() < 250
+    expected = torch.stack((n, n + 0.1, n + 0.2, n + 0.4, n), 1)
+    shown = torch.stack((-n - 0.1, n, -n - 0.2, -n, n + 0.4), 1)
+    torch.testing.assert_close(
+        torch.cat((observations, actions, next_observations), 1), torch.where(mirrored[:, None], shown, expected)
+    )
+
+
 @pytest.mark.parametrize("stored, position", [(3, 2), (8, 0)])
 def test_replay_buffer_goes_on_from_its_state(stored, position):
     buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
@@ -418,8 +439,8 @@ def test_the_tutorials_values_are_the_defaults():
 
 def test_the_tutorials_exact_choices_are_flags():
     flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
-        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
-        --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
+        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --no-mirroring
+        --no-bfloat16-products --initial-log-alpha 0 --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
     agent = make_agent(**TUTORIALS)
     observations = 100 * torch.randn(50, 3)
