@@ -101,8 +101,8 @@ class Config:
     num_threads: int = 1
     """CPU threads of the update; the physics and the evaluations want the other cores"""
     bfloat16_products: bool = True
-    """ours (theirs: none): on CPUs that can, round the factors of the update's matrix products to bfloat16; sums and
-    weights stay float32"""
+    """ours (theirs: no): where the CPU has instructions for it, round the factors of matrix products to bfloat16;
+    weights and sums stay float32"""
     run_dir: str | None = None
     """a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)"""
     resume: str | None = None
@@ -786,7 +786,7 @@ def train(config):
         ranks, saved = run.ranks, run.checkpoint
         episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
         envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=True))
-        torch.backends.mkldnn.matmul.fp32_precision = "bf16" if config.bfloat16_products else "ieee"
+        run.enter(common.bfloat16_products(config.bfloat16_products))
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = SACAgent(config, observation_space, action_space, run.device, ranks)
         buffer = ReplayBuffer(

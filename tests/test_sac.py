@@ -635,6 +635,47 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
     assert tables["eval"][0]["average_return"] != comparable(path)[2]["eval"][0]["average_return"]
 
 
+@pytest.mark.parametrize("mirroring", (True, False))
+def test_train_mirrors_what_the_task_says(mirroring, tmp_path, monkeypatch):
+    """Pendulum's mirror: sin θ, the angular velocity and the torque change their signs."""
+    mirror = (([0, 1, 2], [1, -1, -1]), ([0], [-1]))
+    monkeypatch.setattr(gym.envs.classic_control.PendulumEnv, "MIRROR", mirror, raising=False)
+    path, calls = train(tmp_path / "run", mirroring=mirroring)
+    observations, actions = read_checkpoint(path)[1]["buffer"]["rows"].split((3, 1, 5), dim=1)[:2]
+    stored = torch.cat((observations, actions), 1)
+    batch = torch.cat([torch.cat(batch[:2], 1) for name, (batch, *_) in calls if name == "update"])
+    as_stored = (batch[:, None] == stored).all(2).any(1)
+    in_the_mirror = (batch[:, None] * torch.tensor([1, -1, -1, -1]) == stored).all(2).any(1)
+    assert (as_stored | in_the_mirror).all() and len(batch) == 60 * 32
+    assert 0.45 < in_the_mirror.float().mean() < 0.55 if mirroring else as_stored.all()
+
+
+@pytest.mark.parametrize("bfloat16_products, precision", [(True, "bf16"), (False, "ieee")])
+def test_train_multiplies_as_the_config_says(bfloat16_products, precision, tmp_path, monkeypatch):
+    seen, matmul = set(), torch.backends.mkldnn.matmul
+    step = SACAgent._step
+    monkeypatch.setattr(SACAgent, "_step", lambda *arguments: (seen.add(matmul.fp32_precision), step(*arguments)))
+    before = matmul.fp32_precision
+    train(tmp_path / "run", bfloat16_products=bfloat16_products)
+    assert seen == {precision} and matmul.fp32_precision == before
+
+
+def test_bfloat16_products():
+    torch.manual_seed(0)
+    a, b = torch.randn(2, 128, 128)
+    exact, rounded = a @ b, a.bfloat16().float() @ b.bfloat16().float()
+    with common.bfloat16_products(True):
+        product = a @ b
+    cpuinfo = Path("/proc/cpuinfo")
+    able = cpuinfo.exists() and "amx_bf16" in cpuinfo.read_text()
+    errors = [(product - of).abs().max() for of in (rounded, exact)]
+    assert errors[0] < 1e-4 if able else min(errors) < 1e-4
+    assert (rounded - exact).abs().max() > 0.05
+    with common.bfloat16_products(False):
+        assert torch.equal(a @ b, exact)
+    assert torch.equal(a @ b, exact)
+
+
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
     path, calls = train(tmp_path / "run", num_envs=3)
     # 250 is no multiple of 3. The scaling is fitted before the first update all the same, on all there is.
