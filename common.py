@@ -128,21 +128,6 @@ def keep_freed_memory():
         libc.mallopt(-1, 256 << 20)
 
 
-@contextlib.contextmanager
-def bfloat16_products(enabled):
-    """While it lasts, CPUs with instructions for it multiply float32 matrices with their elements rounded to bfloat16.
-
-    Sums are float32's. oneDNN does it, https://docs.pytorch.org/docs/stable/notes/mkldnn.html; elsewhere nothing changes.
-    """
-    matmul = torch.backends.mkldnn.matmul
-    before = matmul.fp32_precision
-    matmul.fp32_precision = "bf16" if enabled else "ieee"
-    try:
-        yield
-    finally:
-        matmul.fp32_precision = before
-
-
 def random_state():
     """The state of torch's generators, CPU and current GPU: a dict of byte tensors."""
     return {"cpu": torch.get_rng_state()} | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_available() else {})

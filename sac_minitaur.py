@@ -78,9 +78,6 @@ class Config:
     mean_action_episodes: bool = True
     """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean
     action, so that the replay holds where that leads"""
-    mirroring: bool = True
-    """ours (theirs: none): show about half of every batch in a mirror where the task says what that shows, as the
-    Minitaur does: what the legs of one side have learned, those of the other need not find again (arXiv:1909.10707)"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
@@ -100,9 +97,6 @@ class Config:
     """auto, cpu, cuda, cuda:N or mps"""
     num_threads: int = 1
     """CPU threads of the update; the physics and the evaluations want the other cores"""
-    bfloat16_products: bool = True
-    """ours (theirs: no): where the CPU has instructions for it, round the factors of matrix products to bfloat16;
-    weights and sums stay float32"""
     run_dir: str | None = None
     """a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)"""
     resume: str | None = None
@@ -191,14 +185,6 @@ class MinitaurBulletEnv(gym.Env):
     TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])
     OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500
     MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13
-    # A mirror at the robot's side shows the left legs as the right ones, and in each leg the left motor as the right
-    # one; what turns about x or z turns the other way. Of each component: which one it shows, and with which sign.
-    MIRRORED_MOTORS = np.array([5, 4, 7, 6, 1, 0, 3, 2])
-    MIRROR = (
-        (np.concatenate((MIRRORED_MOTORS, 8 + MIRRORED_MOTORS, 16 + MIRRORED_MOTORS, [24, 25, 26, 27])),
-         np.repeat([1, -1, 1, -1, 1], [24, 1, 1, 1, 1])),
-        (np.array([2, 3, 0, 1, 6, 7, 4, 5]), np.ones(8, int)),
-    )  # fmt: skip
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
@@ -494,26 +480,16 @@ class ReplayBuffer:
     A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
     last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
     time limit has not ended, and its last state has a value. Towards the end of an episode fewer than n steps are
-    left: n is then their number. Sampling is a single gather, and a second where there is a `mirror`: the sources and
-    signs of an observation's components (O,), (O,) and those of an action's. Each transition is drawn as it was or as
-    the mirror shows it, with the same probability.
+    left: n is then their number. Sampling is a single gather.
     """
 
-    def __init__(self, capacity, observation_size, action_size, n_step, gamma, num_envs, device, mirror=None):
+    def __init__(self, capacity, observation_size, action_size, n_step, gamma, num_envs, device):
         self.sizes = (observation_size, action_size, 1, 1, observation_size)
         self.n_step, self.gamma = n_step, gamma
         self.rows = torch.empty(capacity, sum(self.sizes), device=device)
         self.size = self.position = 0
         # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
         self.incomplete = [deque() for _ in range(num_envs)]
-        self.mirror = None
-        if mirror:
-            observation, action = mirror
-            columns = (observation, action, ([0], [1]), ([0], [1]), observation)
-            starts = np.cumsum((0, *self.sizes[:-1]))
-            sources = np.concatenate([start + source for start, (source, _) in zip(starts, columns)])
-            signs = np.concatenate([sign for _, sign in columns])
-            self.mirror = torch.as_tensor(sources, device=device), torch.as_tensor(signs, device=device)
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
         """Takes a step of each of K environments: (K, O), (K, …), (K,), (K,), (K,), (K, O), as numpy arrays.
@@ -534,12 +510,8 @@ class ReplayBuffer:
 
     def sample(self, batch_size):
         """A batch drawn uniformly with replacement: (B, O), (B, A), (B,), (B,), (B, O)."""
-        rows = self.rows[torch.randint(self.size, (batch_size,), device=self.rows.device)]
-        if self.mirror:
-            sources, signs = self.mirror
-            mirrored = torch.rand(batch_size, 1, device=rows.device) < 0.5
-            rows = torch.where(mirrored, signs * rows[:, sources], rows)
-        observations, actions, returns, discounts, next_observations = rows.split(self.sizes, dim=1)
+        indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
+        observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
 
     def observations_and_returns(self):
@@ -781,19 +753,17 @@ def train(config):
     check(config)
     with make_env(config.env_id) as env:
         observation_space, action_space, spec = env.observation_space, env.action_space, env.spec
-        mirror = getattr(env.unwrapped, "MIRROR", None) if config.mirroring else None
     with common.Run(config, "sac_minitaur", evaluate) as run:
         ranks, saved = run.ranks, run.checkpoint
         episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
         envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=True))
-        run.enter(common.bfloat16_products(config.bfloat16_products))
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = SACAgent(config, observation_space, action_space, run.device, ranks)
         buffer = ReplayBuffer(
             config.replay_buffer_capacity,
             *(agent.observation_size, agent.action_size),
             *(config.n_step, config.gamma, config.num_envs),
-            *(run.device, mirror),
+            run.device,
         )
         policy_file = common.PolicyFile(agent.policy, observation_space.shape)
         torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches

@@ -283,29 +283,6 @@ def test_dynamics_can_be_given(env):
         assert rollout(env, seed=0, num_steps=10, options={"dynamics": changed}) != drawn[: 1 + 4 * 10], field.name
 
 
-def test_a_mirror_shows_what_mirrored_actions_do(env):
-    """Up to what is not symmetric in the simulation: the constraints between the legs, and the order of its contacts."""
-    (sources, signs), (action_sources, action_signs) = env.unwrapped.MIRROR
-    played = []
-    for mirrored in (False, True):
-        env.reset(seed=3)
-        steps = []
-        for step in range(30):
-            action = trot(step) * np.repeat([1, 0.4, 0.5, 0.2], [2, 2, 2, 2])  # the left legs swing and stretch further
-            action = action_signs * action[action_sources] if mirrored else action
-            observation, reward, *_ = env.step(action.astype(np.float32))
-            steps.append(np.append(observation, reward))
-        played.append(np.array(steps))
-    straight, mirrored = played
-    shown = np.append(straight[:, sources] * signs, straight[:, 28:], axis=1)
-    for values in (slice(0, 8), slice(8, 16), slice(16, 24), [24], [25], [26]):
-        error = np.abs(mirrored - shown)[:, values].mean()
-        assert error < np.abs(shown).max(0)[values].mean() / 5, values
-        if values != [25]:  # pitch looks the same in the mirror
-            assert error < np.abs(mirrored - straight)[:, values].mean() / 4, values
-    assert np.abs(mirrored - shown)[:, 28].mean() < straight[:, 28].std() / 4  # and it is rewarded alike
-
-
 # What other programs see
 
 

@@ -30,8 +30,6 @@ TUTORIALS = dict(
     n_step=1,
     averaged_actor_tau=1.0,
     mean_action_episodes=False,
-    mirroring=False,
-    bfloat16_products=False,
     initial_log_alpha=0.0,
     target_entropy_per_action=-0.5,
     reward_scale_factor=1.0,
@@ -270,25 +268,6 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and returns.shape == (5,)
 
 
-def test_replay_buffer_shows_half_of_its_transitions_in_a_mirror():
-    mirror = (([1, 0], [-1, 1]), ([0], [-1]))
-    buffer = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU, mirror), 0, 3)
-    plain = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU), 0, 3)
-    assert torch.equal(buffer.rows[:3], plain.rows[:3])
-    torch.manual_seed(0)
-    observations, actions, returns, discounts, next_observations = buffer.sample(400)
-    n = returns.log10().round()
-    torch.testing.assert_close(returns, 10**n)
-    assert (discounts == 0.5).all()
-    mirrored = actions[:, 0] < 0
-    assert 150 < mirrored.sum() < 250
-    expected = torch.stack((n, n + 0.1, n + 0.2, n + 0.4, n), 1)
-    shown = torch.stack((-n - 0.1, n, -n - 0.2, -n, n + 0.4), 1)
-    torch.testing.assert_close(
-        torch.cat((observations, actions, next_observations), 1), torch.where(mirrored[:, None], shown, expected)
-    )
-
-
 @pytest.mark.parametrize("stored, position", [(3, 2), (8, 0)])
 def test_replay_buffer_goes_on_from_its_state(stored, position):
     buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
@@ -439,8 +418,8 @@ def test_the_tutorials_values_are_the_defaults():
 
 def test_the_tutorials_exact_choices_are_flags():
     flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
-        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --no-mirroring
-        --no-bfloat16-products --initial-log-alpha 0 --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
+        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
+        --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
     agent = make_agent(**TUTORIALS)
     observations = 100 * torch.randn(50, 3)
@@ -633,47 +612,6 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
     assert not same(agent["actor"], comparable(path)[0]["actor"])
     assert not same(own["buffer"], comparable(path)[1]["buffer"])
     assert tables["eval"][0]["average_return"] != comparable(path)[2]["eval"][0]["average_return"]
-
-
-@pytest.mark.parametrize("mirroring", (True, False))
-def test_train_mirrors_what_the_task_says(mirroring, tmp_path, monkeypatch):
-    """Pendulum's mirror: sin θ, the angular velocity and the torque change their signs."""
-    mirror = (([0, 1, 2], [1, -1, -1]), ([0], [-1]))
-    monkeypatch.setattr(gym.envs.classic_control.PendulumEnv, "MIRROR", mirror, raising=False)
-    path, calls = train(tmp_path / "run", mirroring=mirroring)
-    observations, actions = read_checkpoint(path)[1]["buffer"]["rows"].split((3, 1, 5), dim=1)[:2]
-    stored = torch.cat((observations, actions), 1)
-    batch = torch.cat([torch.cat(batch[:2], 1) for name, (batch, *_) in calls if name == "update"])
-    as_stored = (batch[:, None] == stored).all(2).any(1)
-    in_the_mirror = (batch[:, None] * torch.tensor([1, -1, -1, -1]) == stored).all(2).any(1)
-    assert (as_stored | in_the_mirror).all() and len(batch) == 60 * 32
-    assert 0.45 < in_the_mirror.float().mean() < 0.55 if mirroring else as_stored.all()
-
-
-@pytest.mark.parametrize("bfloat16_products, precision", [(True, "bf16"), (False, "ieee")])
-def test_train_multiplies_as_the_config_says(bfloat16_products, precision, tmp_path, monkeypatch):
-    seen, matmul = set(), torch.backends.mkldnn.matmul
-    step = SACAgent._step
-    monkeypatch.setattr(SACAgent, "_step", lambda *arguments: (seen.add(matmul.fp32_precision), step(*arguments)))
-    before = matmul.fp32_precision
-    train(tmp_path / "run", bfloat16_products=bfloat16_products)
-    assert seen == {precision} and matmul.fp32_precision == before
-
-
-def test_bfloat16_products():
-    torch.manual_seed(0)
-    a, b = torch.randn(2, 128, 128)
-    exact, rounded = a @ b, a.bfloat16().float() @ b.bfloat16().float()
-    with common.bfloat16_products(True):
-        product = a @ b
-    cpuinfo = Path("/proc/cpuinfo")
-    able = cpuinfo.exists() and "amx_bf16" in cpuinfo.read_text()
-    errors = [(product - of).abs().max() for of in (rounded, exact)]
-    assert errors[0] < 1e-4 if able else min(errors) < 1e-4
-    assert (rounded - exact).abs().max() > 0.05
-    with common.bfloat16_products(False):
-        assert torch.equal(a @ b, exact)
-    assert torch.equal(a @ b, exact)
 
 
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
