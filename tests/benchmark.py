@@ -55,11 +55,10 @@ def environment_candidates():
     yield "step", lambda: milliseconds(lambda: env.step(action), 200)
 
 
-def new_agent_and_buffer(num_threads):
-    torch.set_num_threads(num_threads)
+def new_agent_and_buffer(critic_batch_norm):
     spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
-    agent = sac_minitaur.SACAgent(sac_minitaur.Config(), *spaces, torch.device("cpu"), common.Ranks())
-    config = agent.config
+    config = sac_minitaur.Config(critic_batch_norm=critic_batch_norm)
+    agent = sac_minitaur.SACAgent(config, *spaces, torch.device("cpu"), common.Ranks())
     buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, config.n_step, config.gamma, config.num_envs, agent.device)
     buffer.rows.normal_()
     buffer.rows[:, 37] = config.gamma**config.n_step  # nothing terminates
@@ -68,14 +67,14 @@ def new_agent_and_buffer(num_threads):
 
 
 def update_candidates():
-    agent, buffer = new_agent_and_buffer(1)
-
-    def update(num_threads):
+    def update(agent, buffer, num_threads):
         torch.set_num_threads(num_threads)
         return milliseconds(lambda: agent.update(buffer.sample(256)), 100)
 
-    yield "1 thread", lambda: update(1)
-    yield "2 threads", lambda: update(2)
+    normalized, plain = new_agent_and_buffer(critic_batch_norm=True), new_agent_and_buffer(critic_batch_norm=False)
+    yield "1 thread", lambda: update(*normalized, 1)
+    yield "1 thread, target critics instead", lambda: update(*plain, 1)  # of batch normalization, as in the tutorials
+    yield "2 threads", lambda: update(*normalized, 2)
 
 
 def run(*command):
