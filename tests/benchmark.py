@@ -55,26 +55,25 @@ def environment_candidates():
     yield "step", lambda: milliseconds(lambda: env.step(action), 200)
 
 
-def new_agent_and_buffer(critic_batch_norm):
-    spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
-    config = sac_minitaur.Config(critic_batch_norm=critic_batch_norm)
-    agent = sac_minitaur.SACAgent(config, *spaces, torch.device("cpu"), common.Ranks())
-    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, config.n_step, config.gamma, config.num_envs, agent.device)
+def update_candidates():
+    config, cpu = sac_minitaur.Config(), torch.device("cpu")
+    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, config.n_step, config.gamma, config.num_envs, cpu)
     buffer.rows.normal_()
     buffer.rows[:, 37] = config.gamma**config.n_step  # nothing terminates
     buffer.size = 100_000
-    return agent, buffer
 
+    def new_agent(config):
+        spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
+        return sac_minitaur.SACAgent(config, *spaces, cpu, common.Ranks())
 
-def update_candidates():
-    def update(agent, buffer, num_threads):
+    def update(agent, num_threads):
         torch.set_num_threads(num_threads)
         return milliseconds(lambda: agent.update(buffer.sample(256)), 100)
 
-    normalized, plain = new_agent_and_buffer(critic_batch_norm=True), new_agent_and_buffer(critic_batch_norm=False)
-    yield "1 thread", lambda: update(*normalized, 1)
-    yield "1 thread, target critics instead", lambda: update(*plain, 1)  # of batch normalization, as in the tutorials
-    yield "2 threads", lambda: update(*normalized, 2)
+    normalized, plain = new_agent(config), new_agent(sac_minitaur.Config(critic_batch_norm=False))
+    yield "1 thread", lambda: update(normalized, 1)
+    yield "1 thread, target critics instead", lambda: update(plain, 1)  # of batch normalization, as in the tutorials
+    yield "2 threads", lambda: update(normalized, 2)
 
 
 def run(*command):
