@@ -25,7 +25,8 @@ def read(path):
 
 def runs(experiment):
     """The evaluations of an experiment: seed → rows of its `eval.csv`."""
-    return {path.parent.name: read(path) for path in sorted((RESULTS / experiment).glob("seed*/eval.csv"))}
+    paths = sorted((RESULTS / experiment).glob("seed*/eval.csv"), key=lambda path: int(path.parent.name[4:]))
+    return {path.parent.name: read(path) for path in paths}
 
 
 def tutorials():
