@@ -53,15 +53,15 @@ class Config:
 
     learning_rate: float = 1e-3
     """Adam's, at the start"""
-    learning_rate_decay: int = 2_500
-    """ours (theirs: none): updates with this learning rate; after n times as many it is 1 / n of it"""
+    learning_rate_decay: int = 3_000
+    """ours (theirs: none): after this many updates the learning rate is half, after n times as many 1 / (1 + n)"""
     adam_epsilon: float = 1e-7
     """Adam's ε (Keras' default, which the tutorial leaves unsaid)"""
     epsilon: float = 0.1
     """probability of a random action while collecting (TF-Agents' default, which the tutorial leaves unsaid)"""
     gamma: float = 0.99
     """ours (TF-Agents' default, which the tutorial leaves unsaid: 1)"""
-    target_update_tau: float = 0.1
+    target_update_tau: float = 0.05
     """ours (theirs: 1): step of the target network towards the Q-network, after every update"""
     value_offset: bool = True
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
@@ -283,7 +283,7 @@ class DQNAgent:
         self.optimizer = torch.optim.Adam(self.parameters, config.learning_rate, **adam)
         # A policy that balances sees only states that are worth the same, and the noise of large steps upsets it again.
         decay = config.learning_rate_decay
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimizer, lambda updates: 1 / max(1, updates / decay))
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimizer, lambda updates: 1 / (1 + updates / decay))
 
     def random_actions(self, count):
         """Uniform actions (K,), numpy."""
