@@ -76,7 +76,7 @@ def print_ablation(experiment, step):
 
 
 def draw(experiment, title, threshold, names):
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     curves = runs(experiment)
     for rows in curves.values():
@@ -89,7 +89,7 @@ def draw(experiment, title, threshold, names):
         axes.plot(*tutorials()[name], color="C1", linestyle="-:"[i % 2], linewidth=1, label=name.replace("_", " "))
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
-    axes.legend(fontsize="small")
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
     figure.savefig(RESULTS / f"{experiment}.png", dpi=110)
 
 
