@@ -85,8 +85,8 @@ def draw(experiment, title, threshold, names):
     at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
     middle = [median(returns[step] for returns in at) for step in steps]
     axes.plot(steps, middle, color="C0", linewidth=2.5, label=f"ours, median of {len(curves)} seeds (each thin)")
-    for i, name in enumerate(names):
-        axes.plot(*tutorials()[name], color="C1", linestyle="-:"[i % 2], linewidth=1, label=name.replace("_", " "))
+    for name, style in zip(names, ("-", ":", "-.")):
+        axes.plot(*tutorials()[name], color="C1", linestyle=style, linewidth=1, label=name.replace("_", " "))
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
     figure.legend(loc="outside lower center", ncols=3, fontsize="small")
