@@ -103,6 +103,8 @@ def main():
         ("dqn_cartpole_130000", 200),
         ("dqn_cartpole_v1", 475),
         ("dqn_cartpole_v1_unscaled", 475),
+        ("dqn_cartpole_later_decay", 200),
+        ("dqn_cartpole_v1_later_decay", 475),
     ):
         print_table(experiment, goal, late=10_000)
     for experiment, figure in FIGURES.items():
