@@ -24,9 +24,9 @@ def read(path):
 
 
 def runs(experiment):
-    """The evaluations of an experiment: seed → rows of its `eval.csv`."""
-    paths = sorted((RESULTS / experiment).glob("seed*/eval.csv"), key=lambda path: int(path.parent.name[4:]))
-    return {path.parent.name: read(path) for path in paths}
+    """The evaluations of an experiment: seed → rows of its `eval.csv`, by rising seeds."""
+    paths = (RESULTS / experiment).glob("seed*/eval.csv")
+    return dict(sorted((int(path.parent.name.removeprefix("seed")), read(path)) for path in paths))
 
 
 def tutorials():
@@ -57,7 +57,7 @@ def print_table(experiment, goal, late):
         first = next((row["step"] for row in rows if row["step"] > 0 and row["average_return"] >= goal), math.inf)
         summary.append((final, length, best, worst, first))
         spread = f"{final:.2f} ± {rows[-1]['std_return']:.2f}"
-        print(f"| {seed[4:]} | {spread} | {length:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
+        print(f"| {seed} | {spread} | {length:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
     medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 0, 2, 2, 0)))
     print(f"| median | {' | '.join(medians)} |")
 
@@ -67,7 +67,8 @@ def print_ablation(experiment, step):
     names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
     curves = {name: runs(name) for name in (experiment, *names)}
     seeds = sorted(set().union(*(curves[name] for name in names)))
-    print(f"\n### At {step}, without one choice\n\n| without | {' | '.join(seeds)} | median |\n|{' --- |' * (len(seeds) + 2)}")
+    print(f"\n### At {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
+    print(f"|{' --- |' * (len(seeds) + 2)}")
     for name, evaluations in curves.items():
         at = {seed: row["average_return"] for seed, rows in evaluations.items() for row in rows if row["step"] == step}
         returns = [at[seed] for seed in seeds if seed in at]
@@ -85,8 +86,9 @@ def draw(experiment, title, threshold, names):
     at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
     middle = [median(returns[step] for returns in at) for step in steps]
     axes.plot(steps, middle, color="C0", linewidth=2.5, label=f"ours, median of {len(curves)} seeds (each thin)")
+    published = tutorials()
     for name, style in zip(names, ("-", ":", "-.")):
-        axes.plot(*tutorials()[name], color="C1", linestyle=style, linewidth=1, label=name.replace("_", " "))
+        axes.plot(*published[name], color="C1", linestyle=style, linewidth=1, label=name.replace("_", " "))
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
     figure.legend(loc="outside lower center", ncols=3, fontsize="small")
