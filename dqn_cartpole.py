@@ -11,8 +11,9 @@ through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Ever
 those marked "ours" in `Config`. The tutorial discounts by 1 and bootstraps from the network of the step before, so
 that nothing bounds its values: its losses reach 1e10, and those who trained on saw the return fall back to 12 to 32.
 Here the observations come on one scale; values are discounted and start from what an endless episode is worth, so that
-only falling and leaving the track have to be learned; they are bounded by it; a target network follows slowly; the
-values of the two actions, nearly equal after so short a step, are pushed apart; and the learning rate decays.
+only falling and leaving the track have to be learned, and in a unit in which that is a short way; they are bounded by
+it; a target network follows slowly; the values of the two actions, nearly equal after so short a step, are pushed
+apart; and the learning rate decays.
 """
 
 import math
@@ -53,7 +54,7 @@ class Config:
 
     learning_rate: float = 1e-3
     """Adam's, at the start"""
-    learning_rate_decay: int = 3_000
+    learning_rate_decay: int = 1_000
     """ours (theirs: none): after this many updates the learning rate is half, after n times as many 1 / (1 + n)"""
     adam_epsilon: float = 1e-7
     """Adam's ε (Keras' default, which the tutorial leaves unsaid)"""
@@ -61,13 +62,16 @@ class Config:
     """probability of a random action while collecting (TF-Agents' default, which the tutorial leaves unsaid)"""
     gamma: float = 0.99
     """ours (TF-Agents' default, which the tutorial leaves unsaid: 1)"""
-    target_update_tau: float = 0.05
+    target_update_tau: float = 0.1
     """ours (theirs: 1): step of the target network towards the Q-network, after every update"""
     value_offset: bool = True
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
+    value_scale: float = 100.0
+    """ours (theirs: 1): Q changes by this where the network's output changes by 1. Adam moves an output at the pace of
+    its learning rate, whatever the output's unit: for values tens apart, a unit of one reward is a long way"""
     value_bound: bool = True
     """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth for ever"""
-    advantage_learning: float = 0.8
+    advantage_learning: float = 0.9
     """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one. The other action
     comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's errors"""
     layers: tuple[int, ...] = (100, 50)
@@ -317,10 +321,11 @@ class DQNAgent:
         observations, next_observations = both.chunk(2)
         with torch.no_grad():
             next_actions = self.q_network(next_observations).argmax(1)
-            target_q, next_q = self.target_network(both).chunk(2)
+            target_q, next_q = (config.value_scale * self.target_network(both)).chunk(2)
             targets = td_targets(rewards, terminated, self.value_offset + next_q, next_actions, config.gamma, bound)
             targets -= config.advantage_learning * action_gap(target_q, actions)
-        q = self.value_offset + self.q_network(observations).gather(1, actions[:, None]).squeeze(1)
+        output = self.q_network(observations).gather(1, actions[:, None]).squeeze(1)
+        q = self.value_offset + config.value_scale * output
         loss = td_loss(q, targets)
         self.optimizer.zero_grad()
         loss.backward()
@@ -396,6 +401,8 @@ def check(config):
     common.require_batch(config)
     if not 0 <= config.advantage_learning < 1:
         raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
+    if not 0 < config.value_scale < math.inf:
+        raise InputError(f"--value-scale {config.value_scale} is no scale: use a positive number")
     if (config.value_offset or config.value_bound) and config.gamma >= 1:
         raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1")
 

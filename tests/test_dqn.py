@@ -111,11 +111,11 @@ def test_action_gap():
 def test_advantage_learning_pushes_values_apart():
     """Rewards 1 and 0, then the end: the best action stays worth 1, the other falls from 0 to 1 − 1 / (1 − 0.5)."""
     torch.manual_seed(0)
-    agent = make_agent(learning_rate=1e-2, target_update_tau=0.1, advantage_learning=0.5)
+    agent = make_agent(learning_rate=1e-2, target_update_tau=0.1, value_scale=2.0, advantage_learning=0.5)
     actions = torch.arange(16) % 2
     for _ in range(400):
         agent.update((torch.ones(16, 4), actions, 1.0 - actions, torch.ones(16), torch.ones(16, 4)), 1.0)
-    assert agent.q_network(agent.scaling(torch.ones(4))).tolist() == pytest.approx([1, -1], abs=0.02)
+    assert (2 * agent.q_network(agent.scaling(torch.ones(4)))).tolist() == pytest.approx([1, -1], abs=0.02)
 
 
 def test_loss_by_hand():
@@ -253,17 +253,17 @@ def test_learning_rate_decays():
 def test_update_is_double_dqn():
     """The loss that is logged, from the formulas: the Q-network chooses the next action, the target values it."""
     torch.manual_seed(0)
-    agent = make_agent(gamma=0.9)
+    agent = make_agent(gamma=0.9, value_scale=3.0)
     agent.target_network.load_state_dict(QNetwork(4, 2, TINY.layers).state_dict())
     observations, actions, rewards, terminated, next_observations = batch = random_batch(64)
     observations, next_observations = agent.scaling(observations), agent.scaling(next_observations)
     with torch.no_grad():
-        own, target = agent.q_network(next_observations), agent.target_network(next_observations)
+        own, target = agent.q_network(next_observations), 3 * agent.target_network(next_observations)
         assert (own.argmax(1) != target.argmax(1)).any()
         value = torch.where(own[:, 0] > own[:, 1], target[:, 0], target[:, 1])
-        q = torch.where(actions == 0, *agent.q_network(observations).unbind(1))
+        q = 3 * torch.where(actions == 0, *agent.q_network(observations).unbind(1))
         here, other = agent.target_network(observations), agent.target_network(observations).flip(1)
-        gap = torch.where(actions == 0, *(other - here).clamp(min=0).unbind(1))
+        gap = 3 * torch.where(actions == 0, *(other - here).clamp(min=0).unbind(1))
         error = rewards + 0.9 * (1 - terminated) * value - agent.config.advantage_learning * gap - q
     metrics = agent.update(batch, 1.0)
     torch.testing.assert_close(metrics["loss"], error.square().mean())
@@ -274,13 +274,13 @@ def test_learns_values_of_a_known_chain():
     """One state, reward 1, no end: Q → 1 / (1 − γ); where every step terminates: Q → 1."""
     for terminated, value in ((0.0, 2.0), (1.0, 1.0)):
         torch.manual_seed(0)
-        agent = make_agent(gamma=0.5, learning_rate=1e-2, target_update_tau=0.1)
+        agent = make_agent(gamma=0.5, learning_rate=1e-2, target_update_tau=0.1, value_scale=2.0)
         observations = torch.ones(16, 4)
         actions = torch.arange(16) % 2
         batch = observations, actions, torch.ones(16), torch.full((16,), terminated), observations
         for _ in range(400):
             agent.update(batch, 1.0)
-        q = agent.q_network(agent.scaling(torch.ones(4)))
+        q = 2 * agent.q_network(agent.scaling(torch.ones(4)))
         assert q.tolist() == pytest.approx([value, value], abs=0.02)
 
 
@@ -447,6 +447,8 @@ def test_imports_without_pybullet():
         ("--num-envs 0", "num-envs"),
         ("--gamma 1", "gamma"),
         ("--advantage-learning 1", "--advantage-learning"),
+        ("--value-scale 0", "--value-scale"),
+        ("--value-scale nan", "--value-scale"),
         ("--run-dir .", "not empty"),
         ("--resume nowhere", "nowhere"),
         ("--evaluate nowhere.pt2", "nowhere.pt2"),
