@@ -105,6 +105,7 @@ def main():
         ("dqn_cartpole_130000", 200),
         ("dqn_cartpole_v1", 475),
         ("dqn_cartpole_v1_unscaled", 475),
+        ("dqn_cartpole_value_scale_1", 200),
         ("dqn_cartpole_later_decay", 200),
         ("dqn_cartpole_v1_later_decay", 475),
     ):
