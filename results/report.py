@@ -100,16 +100,9 @@ def main():
         if path.is_dir() and "_without_" not in path.name:
             print_table(path.name, goal=15, late=50_000)
     print_ablation("sac_minitaur", step=30_000)
-    for experiment, goal in (
-        ("dqn_cartpole", 200),
-        ("dqn_cartpole_130000", 200),
-        ("dqn_cartpole_v1", 475),
-        ("dqn_cartpole_v1_unscaled", 475),
-        ("dqn_cartpole_value_scale_1", 200),
-        ("dqn_cartpole_later_decay", 200),
-        ("dqn_cartpole_v1_later_decay", 475),
-    ):
-        print_table(experiment, goal, late=10_000)
+    for path in sorted(RESULTS.glob("dqn*")):
+        if path.is_dir():
+            print_table(path.name, goal=475 if "_v1" in path.name else 200, late=10_000)
     for experiment, figure in FIGURES.items():
         draw(experiment, *figure)
 
