@@ -1,6 +1,7 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
     python sac_minitaur.py                                    # about half an hour on two CPU cores, return about 15
+    python sac_minitaur.py --env-id MinitaurLastRewardEnv-v0  # the robot sees its last reward too, and learns much faster
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy

@@ -12,9 +12,20 @@ from statistics import median
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).resolve().parent
+# Name → title, the task's threshold, what is ours in it (experiment → label), the tutorials' runs.
 FIGURES = {
-    "sac_minitaur": ("SAC on the Minitaur", 15.0, ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023")),
-    "dqn_cartpole": ("DQN on CartPole-v0", 195.0, ("dqn_cartpole_tf2.6", "dqn_cartpole_tf2.11")),
+    "sac_minitaur": (
+        "SAC on the Minitaur",
+        15.0,
+        {"sac_minitaur": "ours", "sac_minitaur_last_reward": "ours, last reward observed"},
+        ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
+    ),
+    "dqn_cartpole": (
+        "DQN on CartPole-v0",
+        195.0,
+        {"dqn_cartpole": "ours"},
+        ("dqn_cartpole_tf2.6", "dqn_cartpole_tf2.11"),
+    ),
 }
 
 
@@ -76,23 +87,25 @@ def print_ablation(experiment, step):
         print(f"| {choice} | {' | '.join(number(at.get(seed, math.nan)) for seed in seeds)} | {median(returns):.2f} |")
 
 
-def draw(experiment, title, threshold, names):
+def draw(name, title, threshold, ours, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    curves = runs(experiment)
-    for rows in curves.values():
-        axes.plot([r["step"] for r in rows], [r["average_return"] for r in rows], color="C0", linewidth=0.7, alpha=0.6)
-    steps = sorted(set.intersection(*({row["step"] for row in rows} for rows in curves.values())))
-    at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
-    middle = [median(returns[step] for returns in at) for step in steps]
-    axes.plot(steps, middle, color="C0", linewidth=2.5, label=f"ours, median of {len(curves)} seeds (each thin)")
-    published = tutorials()
-    for name, style in zip(names, ("-", ":", "-.")):
-        axes.plot(*published[name], color="C1", linestyle=style, linewidth=1, label=name.replace("_", " "))
+    for color, (experiment, label) in zip(("C0", "C2"), ours.items()):
+        curves = runs(experiment)
+        for rows in curves.values():
+            returns = [r["average_return"] for r in rows]
+            axes.plot([r["step"] for r in rows], returns, color=color, linewidth=0.7, alpha=0.6)
+        steps = sorted(set.intersection(*({row["step"] for row in rows} for rows in curves.values())))
+        at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
+        middle = [median(returns[step] for returns in at) for step in steps]
+        axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, median of {len(curves)} seeds (each thin)")
+    tutorial_curves = tutorials()
+    for run, style in zip(published, ("-", ":", "-.")):
+        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=run.replace("_", " "))
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
-    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
-    figure.savefig(RESULTS / f"{experiment}.png", dpi=110)
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
+    figure.savefig(RESULTS / f"{name}.png", dpi=110)
 
 
 def main():
@@ -103,8 +116,8 @@ def main():
     for path in sorted(RESULTS.glob("dqn*")):
         if path.is_dir():
             print_table(path.name, goal=475 if "_v1" in path.name else 200, late=10_000)
-    for experiment, figure in FIGURES.items():
-        draw(experiment, *figure)
+    for name, figure in FIGURES.items():
+        draw(name, *figure)
 
 
 if __name__ == "__main__":
