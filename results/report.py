@@ -57,19 +57,22 @@ def number(value, digits=2):
 
 def print_table(experiment, goal, late):
     """One row for each seed: `goal` is the return to reach, `late` the step from which the worst evaluation counts."""
-    print(f"\n### {experiment}\n\n| seed | final return | episode length | best | worst from {late} on | first ≥ {goal} |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    columns = f"at 10000 | at 20000 | final return | episode length | best | worst from {late} on | first ≥ {goal}"
+    print(f"\n### {experiment}\n\n| seed | {columns} |\n|{' --- |' * 8}")
     summary = []
     for seed, rows in runs(experiment).items():
+        at = {row["step"]: row["average_return"] for row in rows}
+        early, later = (at.get(step, math.nan) for step in (10_000, 20_000))
         final, length = rows[-1]["average_return"], rows[-1]["average_episode_length"]
         best = max(row["average_return"] for row in rows)
         worst = min((row["average_return"] for row in rows if row["step"] >= late), default=math.nan)
         # An untrained network may balance by luck (DQN's seed 4).
         first = next((row["step"] for row in rows if row["step"] > 0 and row["average_return"] >= goal), math.inf)
-        summary.append((final, length, best, worst, first))
+        summary.append((early, later, final, length, best, worst, first))
         spread = f"{final:.2f} ± {rows[-1]['std_return']:.2f}"
-        print(f"| {seed} | {spread} | {length:.0f} | {best:.2f} | {number(worst)} | {number(first, 0)} |")
-    medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 0, 2, 2, 0)))
+        print(f"| {seed} | {number(early)} | {number(later)} | {spread} | {length:.0f}", end="")
+        print(f" | {best:.2f} | {number(worst)} | {number(first, 0)} |")
+    medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 2, 2, 0, 2, 2, 0)))
     print(f"| median | {' | '.join(medians)} |")
 
 
