@@ -22,6 +22,7 @@ import signal
 import sys
 import threading
 import time
+import typing
 import zipfile
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
@@ -391,6 +392,8 @@ class Evaluations:
         """Ends the workers without waiting for what they still do."""
         for worker in self.pool._processes.values():
             worker.kill()
+        # Python 3.10 would wait for ever for the dead to read what was being sent to them.
+        self.pool._call_queue._reader.close()
         self.pool.shutdown(cancel_futures=True)
 
 
@@ -790,7 +793,8 @@ def resumed_config(config, parse):
         saved = type(config)(**{key: tuple(v) if isinstance(v, list) else v for key, v in saved.items()})
         for field in fields:
             value = getattr(saved, field.name)
-            if not isinstance(value, tuple | field.type) and not (field.type is float and isinstance(value, int)):
+            kind = tuple if typing.get_origin(field.type) is tuple else field.type
+            if not isinstance(value, kind) and not (kind is float and isinstance(value, int)):
                 raise TypeError(f"{field.name} is {value!r}")
     except FileNotFoundError:
         raise InputError(f"--resume {config.resume}: there is no run there (no {path.name})") from None
