@@ -929,6 +929,7 @@ def record_video(path, env, act, seed):
     """
     import imageio
 
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
     path = Path(path)
     temporary = path.with_name(f".tmp-{path.name}")
     frames_per_second = env.metadata["render_fps"]

@@ -17,7 +17,6 @@ apart; and the learning rate decays.
 """
 
 import math
-import os
 import warnings
 from dataclasses import dataclass
 from functools import partial
@@ -381,7 +380,6 @@ def act(policy, observation):
 
 def film(policy, env_id, seed, path):
     """Films one episode of the policy, or of random actions where it is None."""
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
     env = make_env(env_id, render_mode="rgb_array")
     env.action_space.seed(seed)
     common.record_video(path, env, lambda o: act(policy, o) if policy else env.action_space.sample(), seed)
