@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
+import imageio
 import numpy as np
 import pytest
 import torch
@@ -354,6 +355,16 @@ def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
 
 def die_evaluating(module):
     before_call(module, "act", 3, lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
+    arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
+    run = Process(script, arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
+    assert run.wait() == 0 and not run.stderr, run.stderr
+    for name in ("trained_agent.mp4", "random_agent.mp4"):
+        with imageio.get_reader(tmp_path / "run" / name) as video:
+            frames = [np.asarray(frame) for frame in video]
+        assert len(frames) > 5 and frames[0].std() > 0 and (frames[0] != frames[-1]).any()
 
 
 def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
