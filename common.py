@@ -57,11 +57,18 @@ class RunError(Exception):
     exit_status = 1
 
 
-def require_positive(config, *names):
-    """Raises InputError naming the first of these fields of `config` that is not at least 1."""
+def require_range(config, least, most, *names):
+    """Raises InputError naming the first of these fields of `config` that is not finite and from `least` to `most`.
+
+    A field that holds several numbers needs it of each.
+    """
     for name in names:
-        if getattr(config, name) < 1:
-            raise InputError(f"--{name.replace('_', '-')} {getattr(config, name)} is too small: use 1 or more")
+        value = getattr(config, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(math.isfinite(number) and least <= number <= most for number in numbers):
+            allowed = f"from {least} to {most}" if most < math.inf else f"of {least} or more"
+            allowed = "that is finite" if least == -math.inf else allowed
+            raise InputError(f"--{name.replace('_', '-')} {value} cannot be used: it takes a number {allowed}")
 
 
 def require_batch(config, held_back=0):

@@ -390,12 +390,14 @@ def film(policy, env_id, seed, path):
 
 def check(config):
     """Raises InputError for a value that no run could use."""
-    common.require_positive(
-        config,
-        *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
-        *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
-        *("checkpoint_interval", "learning_rate_decay"),
-    )
+    common.require_range(
+        config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
+        "replay_buffer_capacity", "batch_size", "learning_rate_decay", "layers", "num_threads", "log_interval",
+        "eval_interval", "num_eval_episodes", "checkpoint_interval",
+    )  # fmt: skip
+    common.require_range(config, 0, math.inf, "learning_rate", "adam_epsilon")
+    common.require_range(config, 0, 1, "epsilon", "gamma", "target_update_tau")
+    common.require_range(config, 0, 2**63 - 1, "seed")
     common.require_batch(config)
     if not 0 <= config.advantage_learning < 1:
         raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
@@ -496,6 +498,7 @@ def main():
     if config.resume:
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
     if config.evaluate:
+        check(config)
         common.evaluate_policy_file(config, make_env, evaluate, film)
     else:
         train(config)

@@ -752,12 +752,19 @@ def film(policy, env_id, seed, path):
 
 def check(config):
     """Raises InputError for a value that no run could use."""
-    common.require_positive(
-        config,
-        *("num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs", "batch_size"),
-        *("replay_buffer_capacity", "num_threads", "log_interval", "eval_interval", "num_eval_episodes"),
-        *("checkpoint_interval", "n_step"),
-    )
+    common.require_range(
+        config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
+        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "num_threads", "log_interval",
+        "eval_interval", "num_eval_episodes", "checkpoint_interval",
+    )  # fmt: skip
+    common.require_range(
+        config, 0, math.inf, "actor_learning_rate", "critic_learning_rate", "alpha_learning_rate", "adam_epsilon",
+        "reward_scale_factor", "critic_loss_weight",
+    )  # fmt: skip
+    common.require_range(config, 0, 1, "target_update_tau", "gamma", "averaged_actor_tau")
+    common.require_range(config, 0, math.nextafter(1, 0), "adam_beta1")
+    common.require_range(config, -math.inf, math.inf, "target_entropy_per_action", "initial_log_alpha")
+    common.require_range(config, 0, 2**63 - 1, "seed")
     # Every environment's last transitions are not complete yet.
     common.require_batch(config, held_back=config.num_envs * (config.n_step - 1))
 
@@ -861,6 +868,7 @@ def main():
     if config.resume:
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
     if config.evaluate:
+        check(config)
         common.evaluate_policy_file(config, make_env, evaluate, film)
     else:
         train(config)

@@ -754,6 +754,18 @@ def assert_one_line(status, stderr):
         ("--eval-interval -1", "--eval-interval"),
         ("--num-eval-episodes 0", "--num-eval-episodes"),
         ("--checkpoint-interval 0", "--checkpoint-interval"),
+        ("--critic-layers 0", "--critic-layers"),
+        ("--actor-learning-rate -1", "--actor-learning-rate"),
+        ("--critic-learning-rate nan", "--critic-learning-rate"),
+        ("--adam-epsilon -1", "--adam-epsilon"),
+        ("--adam-beta1 1", "--adam-beta1"),
+        ("--gamma 1.01", "--gamma"),
+        ("--target-update-tau -0.1", "--target-update-tau"),
+        ("--averaged-actor-tau 7", "--averaged-actor-tau"),
+        ("--reward-scale-factor inf", "--reward-scale-factor"),
+        ("--initial-log-alpha nan", "--initial-log-alpha"),
+        ("--seed -1", "--seed"),
+        ("--seed 9223372036854775808", "--seed"),
         ("--resume nowhere", "nowhere"),
         ("--evaluate nowhere.pt2", "nowhere.pt2"),
         ("--evaluate full/file", "full/file"),
@@ -773,6 +785,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     assert_one_line(status, output.err)
     assert named in output.err and output.out == ""
     assert (tmp_path / "full" / "file").read_text() == "somebody's work"
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("arguments", ["--env-id NoSuchTask-v0", "--env-id Pendulum-v1 --device cuda:77"])
