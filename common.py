@@ -136,6 +136,15 @@ def keep_freed_memory():
         libc.mallopt(-1, 256 << 20)
 
 
+def empty_replay(capacity, columns, device):
+    """An uninitialized float32 tensor (capacity, columns). Raises InputError when the device has not that much memory."""
+    try:
+        return torch.empty(capacity, columns, device=device)
+    except RuntimeError:
+        size = f"{capacity * columns * 4 / 1e9:.1f} GB"
+        raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
+
+
 def random_state():
     """The state of torch's generators, CPU and current GPU: a dict of byte tensors."""
     return {"cpu": torch.get_rng_state()} | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_available() else {})

@@ -199,7 +199,7 @@ class ReplayBuffer:
 
     def __init__(self, capacity, observation_size, device):
         self.sizes = (observation_size, 1, 1, 1, observation_size)
-        self.rows = torch.empty(capacity, sum(self.sizes), device=device)
+        self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
         self.largest_reward = -math.inf
 

@@ -507,7 +507,7 @@ class ReplayBuffer:
     def __init__(self, capacity, observation_size, action_size, n_step, gamma, num_envs, device):
         self.sizes = (observation_size, action_size, 1, 1, observation_size)
         self.n_step, self.gamma = n_step, gamma
-        self.rows = torch.empty(capacity, sum(self.sizes), device=device)
+        self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
         # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
         self.incomplete = [deque() for _ in range(num_envs)]

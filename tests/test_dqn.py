@@ -442,6 +442,7 @@ def test_imports_without_pybullet():
         ("--device tpu", "tpu"),
         ("--batch-size 101", "batch"),
         ("--replay-buffer-capacity 63", "batch"),
+        ("--replay-buffer-capacity 1000000000000", "44000.0 GB"),
         ("--num-iterations 0", "num-iterations"),
         ("--num-iterations -5", "num-iterations"),
         ("--num-envs 0", "num-envs"),

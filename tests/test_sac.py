@@ -748,6 +748,7 @@ def assert_one_line(status, stderr):
         ("--collect-steps-per-iteration 0", "--collect-steps-per-iteration"),
         ("--num-envs 0", "--num-envs"),
         ("--replay-buffer-capacity -1", "--replay-buffer-capacity"),
+        ("--replay-buffer-capacity 1000000000000", "--replay-buffer-capacity 1000000000000 takes 36000.0 GB"),
         ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
         ("--num-threads 0", "--num-threads"),
         ("--log-interval 0", "--log-interval"),
@@ -785,7 +786,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     assert_one_line(status, output.err)
     assert named in output.err and output.out == ""
     assert (tmp_path / "full" / "file").read_text() == "somebody's work"
-    assert not (tmp_path / "run").exists()
+    assert (tmp_path / "run").exists() == ("GB" in named)  # only memory is found out later
 
 
 @pytest.mark.parametrize("arguments", ["--env-id NoSuchTask-v0", "--env-id Pendulum-v1 --device cuda:77"])
