@@ -599,10 +599,15 @@ class Run:
         self.print(f"replay buffer of {buffer_bytes / 1e6:.0f} MB when full; run directory {self.path}")
 
     def print(self, line):
-        """Prints a line, above the progress bar where there is one."""
-        if self.writes:
+        """Prints a line, above the progress bar where there is one. Stops the run when nobody reads on (`| head`)."""
+        if not self.writes:
+            return
+        try:
             tqdm.write(line)
             sys.stdout.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            self.stop.requested = True
 
     def log(self, table, row):
         """Appends a row, a dict that starts with `step`, to a table: to its CSV and to TensorBoard."""

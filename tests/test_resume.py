@@ -198,6 +198,21 @@ def signal_itself(module):
     before_call(getattr(module, AGENTS[module.__name__]), "update", 50, lambda: os.killpg(0, number))
 
 
+def test_stops_when_nobody_reads_on(script, tmp_path):
+    """As after `| head`: with a checkpoint, not with a broken pipe."""
+    run = finish(script, flags(script, tmp_path / "run"), tmp_path / "output", lose_the_reader_at_update_50)
+    assert not run.stderr and 50 < checkpoint(tmp_path / "run")["shared"]["step"] < 300
+
+
+def lose_the_reader_at_update_50(module):
+    def lose_it():
+        reader, writer = os.pipe()
+        os.dup2(writer, 1)
+        os.close(reader)
+
+    before_call(getattr(module, AGENTS[module.__name__]), "update", 50, lose_it)
+
+
 def test_second_interrupt_stops_at_once(script, tmp_path):
     run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", interrupt_twice)
     assert run.wait() == 130
