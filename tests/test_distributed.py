@@ -101,7 +101,7 @@ def tiny(name, run_dir):
     return flags(name, run_dir, "--num-envs", 2, "--collect-steps-per-iteration", 2, "--num-iterations", 240)
 
 
-@pytest.fixture(scope="module", params=[("sac_minitaur", 3), ("dqn_cartpole", 2)])
+@pytest.fixture(scope="module", params=[("sac_minitaur", 2), ("dqn_cartpole", 3)])
 def trained(request, tmp_path_factory):
     """A run of N processes that was left alone: its directory, its processes and N."""
     script, world_size = request.param
