@@ -20,6 +20,12 @@ FIGURES = {
         {"sac_minitaur": "ours", "sac_minitaur_last_reward": "ours, last reward observed"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
+    "sac_minitaur_long": (
+        "SAC on the Minitaur, continued",
+        15.0,
+        {"sac_minitaur_long": "ours", "sac_minitaur_last_reward_long": "ours, last reward observed"},
+        (),
+    ),
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
@@ -101,7 +107,8 @@ def draw(name, title, threshold, ours, published):
         steps = sorted(set.intersection(*({row["step"] for row in rows} for rows in curves.values())))
         at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
         middle = [median(returns[step] for returns in at) for step in steps]
-        axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, median of {len(curves)} seeds (each thin)")
+        counted = f"median of {len(curves)} seeds (each thin)" if len(curves) > 1 else "one seed"
+        axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, {counted}")
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
         axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=run.replace("_", " "))
