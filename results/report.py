@@ -114,6 +114,7 @@ def draw(name, title, threshold, ours, published):
         axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=run.replace("_", " "))
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
+    axes.ticklabel_format(style="plain")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     figure.savefig(RESULTS / f"{name}.png", dpi=110)
 
