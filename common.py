@@ -65,9 +65,11 @@ def require_range(config, least, most, *names):
     for name in names:
         value = getattr(config, name)
         numbers = value if isinstance(value, tuple) else (value,)
-        if not all(math.isfinite(number) and least <= number <= most for number in numbers):
-            allowed = f"from {least} to {most}" if most < math.inf else f"of {least} or more"
-            allowed = "that is finite" if least == -math.inf else allowed
+        if not all(least <= number <= most and abs(number) < math.inf for number in numbers):
+            if most < math.inf:
+                allowed = f"from {least} to {most}"
+            else:
+                allowed = f"of {least} or more" if least > -math.inf else "that is finite"
             raise InputError(f"--{name.replace('_', '-')} {value} cannot be used: it takes a number {allowed}")
 
 
