@@ -61,8 +61,6 @@ class Config:
     critic_batch_norm: bool = True
     """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
     (arXiv:1902.05605): what is learned is then worth something a step later, not a fifth of the run"""
-    critic_quantiles: int = 16
-    """ours (theirs: 1, the mean): quantiles of the return that each critic estimates"""
     target_update_tau: float = 0.005
     """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
@@ -464,21 +462,18 @@ class Actor(nn.Module):
 
 
 class TwinCritics(nn.Module):
-    """Two estimates of the return's distribution, independent of each other but for their data.
+    """Two estimates of Q(s, a), independent of each other but for their data."""
 
-    Each is N quantiles, at the levels (i + ½) / N, whose mean is Q(s, a). With one of them that is Q(s, a) itself.
-    """
-
-    def __init__(self, observation_size, action_size, hidden_layers, quantiles, normalization=None):
+    def __init__(self, observation_size, action_size, hidden_layers, normalization=None):
         super().__init__()
         inputs = observation_size + action_size
-        self.q1 = mlp(inputs, hidden_layers, quantiles, normalization)
-        self.q2 = mlp(inputs, hidden_layers, quantiles, normalization)
+        self.q1 = mlp(inputs, hidden_layers, 1, normalization)
+        self.q2 = mlp(inputs, hidden_layers, 1, normalization)
 
     def forward(self, observation, action):
-        """Quantiles (2, …, N) for scaled observations (…, O) and actions (…, A)."""
+        """(2, …) for scaled observations (…, O) and actions (…, A)."""
         x = torch.cat((observation, action), dim=-1)
-        return torch.stack((self.q1(x), self.q2(x)))
+        return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
 
 
 class Policy(nn.Module):
@@ -560,30 +555,18 @@ class ReplayBuffer:
 # The agent
 
 
-def td_targets(returns, discounts, next_z, next_log_probs, alpha):
-    """R + discount × (z(s', a') − α log π(a'|s')): (B, N), with z the quantiles of the twin whose Q(s', a') is the lower.
+def td_targets(returns, discounts, next_q, next_log_probs, alpha):
+    """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
-    next_z (2, B, N), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
+    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
     reward and γ (1 − terminated), n of them and what they leave of γ (the entropy of the steps between is left out).
     """
-    first, second = next_z
-    lower = torch.where((first.mean(1) < second.mean(1))[:, None], first, second)
-    return returns[:, None] + discounts[:, None] * (lower - alpha * next_log_probs[:, None])
+    return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
 
 
-def critic_loss(z, targets, weight):
-    """`weight` × the mean loss of all pairs of an estimate and a target, both twins' added: z (2, B, N), targets (B, N).
-
-    An error u = target − z costs |τ − [u < 0]| times Huber's ½ u², linear beyond 1, where τ is the estimate's level: its
-    part of the targets comes to lie below (arXiv:1710.10044, equation 10). One estimate costs u², as the tutorials'.
-    """
-    quantiles = z.shape[-1]
-    if quantiles == 1:
-        return weight * (z - targets).square().mean((1, 2)).sum()
-    levels = ((torch.arange(quantiles, device=z.device) + 0.5) / quantiles)[:, None]
-    z, targets = torch.broadcast_tensors(z[..., None], targets[:, None])  # (2, B, N, N)
-    asymmetry = (levels - (targets < z).float()).abs()
-    return weight * (asymmetry * F.huber_loss(z, targets, reduction="none")).mean((1, 2, 3)).sum()
+def critic_loss(q, targets, weight):
+    """The sum over the twins of `weight` × mean squared error: q (2, B), targets (B,)."""
+    return weight * (q - targets).square().mean(1).sum()
 
 
 def actor_loss(log_probs, q, alpha):
@@ -612,9 +595,7 @@ class SACAgent:
         self.reward_scale = torch.tensor(config.reward_scale_factor, device=device)
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
-        self.critics = TwinCritics(
-            observation_size, action_size, config.critic_layers, config.critic_quantiles, normalization
-        ).to(device)
+        self.critics = TwinCritics(observation_size, action_size, config.critic_layers, normalization).to(device)
         # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
@@ -677,21 +658,21 @@ class SACAgent:
         with torch.no_grad():
             next_actions, next_log_probs = self.actor.sample(next_observations)
         if self.target_critics:
-            z = self.critics(observations, actions)
-            next_z = self.target_critics(next_observations, next_actions)
+            q = self.critics(observations, actions)
+            next_q = self.target_critics(next_observations, next_actions)
         else:
             # Both in one pass: normalized apart, what the replay did and what the actor would do could not be compared.
             self.critics.train()
             both = torch.cat((observations, next_observations)), torch.cat((actions, next_actions))
-            z, next_z = self.critics(*both).chunk(2, dim=1)
+            q, next_q = self.critics(*both).chunk(2, dim=1)
             self.critics.eval()
         with torch.no_grad():
-            targets = td_targets(returns, discounts, next_z, next_log_probs, alpha)
-        loss_q = critic_loss(z, targets, config.critic_loss_weight)
+            targets = td_targets(returns, discounts, next_q, next_log_probs, alpha)
+        loss_q = critic_loss(q, targets, config.critic_loss_weight)
         self._step(self.critic_optimizer, loss_q, self.critic_parameters)
 
         new_actions, log_probs = self.actor.sample(observations)
-        loss_pi = actor_loss(log_probs, self.critics(observations, new_actions).mean(-1), alpha)
+        loss_pi = actor_loss(log_probs, self.critics(observations, new_actions), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
         self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
 
@@ -704,7 +685,7 @@ class SACAgent:
             "alpha_loss": loss_alpha.detach(),
             "alpha": alpha,
             "entropy": -log_probs.detach().mean(),
-            "mean_q": z.detach().mean(),
+            "mean_q": q.detach().mean(),
         }
 
     def _step(self, optimizer, loss, parameters):
@@ -773,8 +754,8 @@ def check(config):
     """Raises InputError for a value that no run could use."""
     common.require_range(
         config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
-        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "critic_quantiles", "num_threads",
-        "log_interval", "eval_interval", "num_eval_episodes", "checkpoint_interval",
+        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "num_threads", "log_interval",
+        "eval_interval", "num_eval_episodes", "checkpoint_interval",
     )  # fmt: skip
     common.require_range(
         config, 0, math.inf, "actor_learning_rate", "critic_learning_rate", "alpha_learning_rate", "adam_epsilon",

@@ -2,7 +2,6 @@
 
 import copy
 import csv
-import itertools
 import json
 import math
 import os
@@ -27,7 +26,6 @@ TUTORIALS = dict(
     observation_scaling=False,
     reward_scaling=False,
     critic_batch_norm=False,
-    critic_quantiles=1,
     adam_beta1=0.9,
     n_step=1,
     averaged_actor_tau=1.0,
@@ -64,47 +62,20 @@ def test_td_targets():
     targets = sac_minitaur.td_targets(
         returns=torch.tensor([1.0, 1.0, -2.0]),
         discounts=torch.tensor([0.9, 0.0, 0.81]),
-        next_z=torch.tensor([[[4.0], [4.0], [7.0]], [[3.0], [3.0], [9.0]]]),
+        next_q=torch.tensor([[4.0, 4.0, 7.0], [3.0, 3.0, 9.0]]),
         next_log_probs=torch.tensor([-2.0, -2.0, 4.0]),
         alpha=torch.tensor(0.5),
     )
     # The second's episode has ended: 1 + 0.9 (3 + 0.5 · 2), 1, and two steps before its value −2 + 0.81 (7 − 0.5 · 4).
-    torch.testing.assert_close(targets, torch.tensor([[4.6], [1.0], [2.05]]))
+    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.05]))
 
 
-def test_td_targets_are_the_quantiles_of_the_twin_with_the_lower_mean():
-    next_z = torch.tensor([[[0.0, 9.0], [5.0, 7.0]], [[4.0, 6.0], [1.0, 8.0]]])  # means 4.5 and 6, 5 and 4.5
-    one = torch.ones(2)
-    targets = sac_minitaur.td_targets(one, 0.5 * one, next_z, -one, torch.tensor(2.0))
-    assert targets.tolist() == [[2.0, 6.5], [2.5, 6.0]]  # 1 + 0.5 (z + 2), never a mixture of both
-
-
-def test_critic_loss_of_one_estimate_is_the_tutorials():
-    z = torch.tensor([[[1.0], [2.0]], [[3.0], [5.0]]], requires_grad=True)
-    loss = sac_minitaur.critic_loss(z, torch.tensor([[2.0], [2.0]]), weight=0.5)
+def test_critic_loss():
+    q = torch.tensor([[1.0, 2.0], [3.0, 5.0]], requires_grad=True)
+    loss = sac_minitaur.critic_loss(q, torch.tensor([2.0, 2.0]), weight=0.5)
     assert loss.item() == 0.5 * ((1 + 0) / 2 + (1 + 9) / 2)
     loss.backward()
-    assert z.grad.squeeze(2).tolist() == [[-0.5, 0.0], [0.5, 1.5]]  # (q − target) / B: towards the target
-
-
-def test_critic_loss_of_quantiles():
-    z = torch.tensor([[[0.0, 3.0]]], requires_grad=True)
-    loss = sac_minitaur.critic_loss(z, torch.tensor([[0.5, 2.5]]), weight=2.0)
-    # Level ¼ misses by 0.5 and 2.5, level ¾ by −2.5 and −0.5: ¼ each of ½ 0.5² and 2.5 − ½, over four pairs.
-    assert loss.item() == 2 * 2 * 0.25 * (0.125 + 2) / 4
-    loss.backward()
-    assert z.grad.tolist() == [[[-2 * 0.25 * (0.5 + 1) / 4, 2 * 0.25 * (1 + 0.5) / 4]]]
-
-
-def test_critics_learn_the_quantiles_of_the_return():
-    targets = torch.arange(40.0).repeat(1, 1)
-    z = torch.zeros(2, 1, 4, requires_grad=True)
-    optimizer = torch.optim.Adam([z], 0.3)
-    for _ in range(1000):
-        optimizer.zero_grad()
-        sac_minitaur.critic_loss(z, targets, 0.5).backward()
-        optimizer.step()
-    torch.testing.assert_close(z[1, 0], torch.tensor([4.5, 14.5, 24.5, 34.5]), rtol=0, atol=0.6)  # of 0 to 39
+    assert q.grad.tolist() == [[-0.5, 0.0], [0.5, 1.5]]  # (q − target) / B: towards the target
 
 
 def test_actor_loss():
@@ -180,9 +151,9 @@ def test_networks_start_glorot_uniform():
 def test_twin_critics_are_independent():
     critics = make_agent().critics
     observations, actions, *_ = make_batch()
-    z = critics(observations, actions)
-    assert z.shape == (2, 32, 16) and not torch.allclose(z[0], z[1])
-    z[0].sum().backward()
+    q = critics(observations, actions)
+    assert q.shape == (2, 32) and not torch.allclose(q[0], q[1])
+    q[0].sum().backward()
     assert all(parameter.grad.any() for parameter in critics.q1.parameters())
     assert not any(parameter.grad.any() for parameter in critics.q2.parameters())
 
@@ -314,11 +285,11 @@ def test_replay_buffer_goes_on_from_its_state(stored, position):
 # The agent
 
 
-@pytest.mark.parametrize("batch_norm, quantiles", [(True, 3), (False, 1)])
-def test_update_is_one_step_of_each_gradient(batch_norm, quantiles):
+@pytest.mark.parametrize("batch_norm", (True, False))
+def test_update_is_one_step_of_each_gradient(batch_norm):
     """Against separate gradients and Adam's first step by hand: −lr · g / (|g| + ε)."""
     choices = dict(adam_epsilon=1e-2, critic_learning_rate=1e-3, actor_learning_rate=2e-3, alpha_learning_rate=3e-3)
-    agent = make_agent(**choices, critic_batch_norm=batch_norm, critic_quantiles=quantiles)
+    agent = make_agent(**choices, critic_batch_norm=batch_norm)
     config, batch = agent.config, make_batch()
     agent.fit_scaling(5 * batch[0] + 1, 3 * batch[2])
     observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
@@ -343,20 +314,13 @@ def test_update_is_one_step_of_each_gradient(batch_norm, quantiles):
     with torch.no_grad():
         next_actions, next_log_probs = actor.sample(next_observations)
     if batch_norm:
-        z = critics(torch.cat((observations, next_observations)), torch.cat((actions, next_actions)))
-        z, next_z = z[:, :32], z[:, 32:].detach()
+        q = critics(torch.cat((observations, next_observations)), torch.cat((actions, next_actions)))
+        q, next_q = q[:, :32], q[:, 32:].detach()
         critics.eval()
     else:
-        z, next_z = critics(observations, actions), target_critics(next_observations, next_actions).detach()
-    loss = 0.0
-    for b in range(32):
-        lower = min(next_z[:, b], key=torch.mean)
-        targets = returns[b] + discounts[b] * (lower - alpha * next_log_probs[b])
-        for twin, i, target in itertools.product(range(2), range(quantiles), targets):
-            u, level = target - z[twin, b, i], (i + 0.5) / quantiles
-            huber = u**2 / 2 if u.abs() <= 1 else u.abs() - 0.5
-            error = u**2 if quantiles == 1 else (level if u > 0 else 1 - level) * huber
-            loss += 0.5 * error / (32 * quantiles**2)
+        q, next_q = critics(observations, actions), target_critics(next_observations, next_actions).detach()
+    targets = returns + discounts * (next_q.min(0).values - alpha * next_log_probs)
+    loss = 0.5 * ((q[0] - targets) ** 2).mean() + 0.5 * ((q[1] - targets) ** 2).mean()
     critic_gradients = torch.autograd.grad(loss, list(critics.parameters()))
     adam_step(critics.parameters(), critic_gradients, config.critic_learning_rate)
     assert metrics["critic_loss"].item() == pytest.approx(loss.item(), rel=1e-5)
@@ -366,7 +330,7 @@ def test_update_is_one_step_of_each_gradient(batch_norm, quantiles):
         torch.testing.assert_close(own.grad, gradient, rtol=1e-4, atol=1e-6)
 
     new_actions, log_probs = actor.sample(observations)  # the actor learns from the critics that have just moved
-    loss = (alpha * log_probs - critics(observations, new_actions).mean(2).min(0).values).mean()
+    loss = (alpha * log_probs - critics(observations, new_actions).min(0).values).mean()
     gradients = torch.autograd.grad(loss, list(actor.parameters()))
     adam_step(actor.parameters(), gradients, config.actor_learning_rate)
     assert metrics["actor_loss"].item() == pytest.approx(loss.item(), rel=1e-4)
@@ -397,7 +361,7 @@ def test_update_learns_from_terminated_and_truncated_differently():
         torch.manual_seed(0)
         agent = make_agent(**TUTORIALS)
         losses.append(agent.update((*batch[:3], discounts, batch[4]))["critic_loss"].item())
-    q = make_agent(**TUTORIALS).critics(*batch[:2]).squeeze(2)
+    q = make_agent(**TUTORIALS).critics(*batch[:2])
     assert losses[1] == pytest.approx(0.5 * (q - batch[2]).square().mean(1).sum().item(), rel=1e-5)
     assert abs(losses[0] - losses[1]) > 0.01
 
@@ -453,7 +417,7 @@ def test_the_tutorials_values_are_the_defaults():
 
 
 def test_the_tutorials_exact_choices_are_flags():
-    flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm --critic-quantiles 1
+    flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
         --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
         --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
