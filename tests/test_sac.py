@@ -304,10 +304,10 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
     actions, returns, discounts = batch[1], agent.reward_scale * batch[2], batch[3]
     alpha = agent.log_alpha.exp().item()
-    if not batch_norm:
-        with torch.no_grad():
-            for parameter in agent.target_critics.parameters():  # else they would equal the critics
-                parameter += 0.05 * torch.randn_like(parameter)
+    with torch.no_grad():
+        followers = (agent.averaged_actor,) if batch_norm else (agent.averaged_actor, agent.target_critics)
+        for parameter in nn.ModuleList(followers).parameters():  # else they would equal what they follow
+            parameter += 0.05 * torch.randn_like(parameter)
     actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
     averaged = [parameter.clone() for parameter in agent.averaged_actor.parameters()]
 
@@ -621,6 +621,20 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
     assert not same(agent["actor"], comparable(path)[0]["actor"])
     assert not same(own["buffer"], comparable(path)[1]["buffer"])
     assert tables["eval"][0]["average_return"] != comparable(path)[2]["eval"][0]["average_return"]
+
+
+@pytest.mark.parametrize("mean_action_episodes", (True, False))
+def test_every_second_episode_is_collected_by_the_mean_action(mean_action_episodes, tmp_path, monkeypatch):
+    act, flags = SACAgent.act, []
+
+    def recorded(self, observations, sampled):
+        flags.extend(sampled)
+        return act(self, observations, sampled)
+
+    monkeypatch.setattr(SACAgent, "act", recorded)
+    choices = dict(initial_collect_steps=150, num_iterations=270, mean_action_episodes=mean_action_episodes)
+    train(tmp_path / "run", **choices)  # episodes of 200 steps
+    assert flags == 50 * [True] + 200 * [not mean_action_episodes] + 20 * [True]
 
 
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
