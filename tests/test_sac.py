@@ -400,8 +400,8 @@ def test_alpha_moves_towards_the_target_entropy(target_entropy, direction):
 def test_fit_scaling():
     agent = make_agent(reward_scale_factor=6.0)
     observations = torch.tensor([[1.0, 10.0, 7.0], [3.0, 30.0, 7.0]])
-    agent.fit_scaling(observations, torch.tensor([-1.0, 5.0]))
-    assert agent.reward_scale.item() == pytest.approx(6 / 3)
+    agent.fit_scaling(observations, torch.tensor([-0.001, 0.005]))  # about as much as the Minitaur's
+    assert agent.reward_scale.item() == pytest.approx(6 / 0.003)
     assert agent.scaling.mean.tolist() == [2, 20, 7]
     assert agent.policy.scaling is agent.scaling  # so it is evaluated and exported with the policy
 
@@ -721,6 +721,14 @@ def test_evaluates_the_best_policy(tiny_run, monkeypatch, capsys):
     assert line.startswith(f"{file}: AverageReturn = ") and "AverageEpisodeLength = 200.0" in line
     best = max(row["average_return"] for row in read_csv(path / "eval.csv"))
     assert float(line.split(" = ")[1].split()[0]) == pytest.approx(best, rel=1e-3)
+
+
+def test_evaluate_plays_one_seeded_episode_in_the_tasks_units():
+    episode_return, length = sac_minitaur.evaluate(lambda o: torch.full((len(o), 1), 1.5), "Pendulum-v1", seed=3)
+    with gym.make("Pendulum-v1") as env:
+        env.reset(seed=3)
+        rewards = [float(env.step(np.array([1.5], np.float32))[1]) for _ in range(200)]
+    assert length == 200 and episode_return == pytest.approx(sum(rewards))
 
 
 # Learning
