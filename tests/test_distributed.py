@@ -44,12 +44,17 @@ def joined_batch(module):
 
 
 def gradients_of_update(module, ranks):
-    """The gradients that one update leaves on this rank, which has its share of the joined batch."""
+    """The gradients that one update leaves on this rank, which has its share of the joined batch and of the first data."""
     torch.set_num_threads(1)
     torch.randn_like = torch.zeros_like  # the actor's samples, which ranks draw apart
     agent = new_agent(module, ranks)
     batch = [part[ranks.rank :: ranks.world_size] for part in joined_batch(module)]
-    agent.update(batch, 10.0) if module.__name__ == "dqn_cartpole" else agent.update(batch)
+    if module.__name__ == "dqn_cartpole":
+        agent.fit_offset(batch[2])
+        agent.update(batch, 10.0)
+    else:
+        agent.fit_scaling(batch[0], batch[2])
+        agent.update(batch)
     groups = [g for name, o in vars(agent).items() if name.endswith("optimizer") for g in o.param_groups]
     return [parameter.grad for group in groups for parameter in group["params"]]
 
