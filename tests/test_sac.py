@@ -731,6 +731,12 @@ def test_evaluate_plays_one_seeded_episode_in_the_tasks_units():
     assert length == 200 and episode_return == pytest.approx(sum(rewards))
 
 
+def test_evaluation_episodes_are_none_of_trainings():
+    evaluation = {common.episode_seed(0, common.EVALUATION_KEY, episode) for episode in range(100)}
+    training = {common.episode_seed(0, env, episode) for env in range(100) for episode in range(100)}
+    assert len(evaluation) == 100 and len(training) == 10_000 and not evaluation & training
+
+
 # Learning
 
 
