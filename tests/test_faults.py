@@ -367,6 +367,32 @@ def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
         assert len(frames) > 5 and frames[0].std() > 0 and (frames[0] != frames[-1]).any()
 
 
+class Blinking(gym.Env):
+    """Thirty steps at 120 a second."""
+
+    metadata = {"render_fps": 120}
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        return 0, 0.0, self.steps == 30, False, {}
+
+    def render(self):
+        return np.full((16, 16, 3), 8 * self.steps, np.uint8)
+
+
+def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
+    common.record_video(tmp_path / "film.mp4", Blinking(), lambda observation: 0, seed=0)
+    with imageio.get_reader(tmp_path / "film.mp4") as video:
+        brightness = [frame.mean() for frame in video]
+        assert video.get_meta_data()["fps"] == 40
+    assert brightness == pytest.approx([24 * i for i in range(11)], abs=3)  # every third step, and the last
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
 def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = finish(script, arguments, tmp_path / "output", die_filming)

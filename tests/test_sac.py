@@ -573,6 +573,15 @@ def test_train_writes_its_rows(tiny_run):
     assert rows[-1]["collect_episode_length"] == 200  # the one episode that ended is the random one
 
 
+def test_of_collected_episodes_the_last_ten_are_reported():
+    episodes = common.Episodes(num_envs=1, seed=0)
+    assert math.isnan(episodes.recent()["collect_return"])
+    for episode in range(12):
+        for i in range(episode + 1):  # returns and lengths 1 to 12
+            episodes.record(np.zeros((1, 1)), np.ones(1), np.array([i == episode]))
+    assert episodes.recent() == {"collect_return": 7.5, "collect_episode_length": 7.5}
+
+
 def test_train_moves_every_parameter(tiny_run):
     path, _ = tiny_run
     config = Config(**TINY)
