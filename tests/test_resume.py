@@ -10,6 +10,7 @@ import io
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -178,6 +179,18 @@ def test_raised_run_equals_a_longer_one(script, reference, tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert_same_run(tmp_path / "run", reference)
+
+
+def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
+    """Where its file was written after the checkpoint, and no evaluation to come is as good."""
+    shutil.copytree(reference, tmp_path / "run")
+    state = checkpoint(tmp_path / "run")
+    state["shared"]["best_return"], best = 1e9, state["shared"]["best_weights"]
+    torch.save(state, tmp_path / "run" / "checkpoint.pt")
+    (tmp_path / "run" / "best_policy.pt2").write_bytes(b"of an evaluation to come")
+    finish(script, ["--resume", tmp_path / "run"], tmp_path / "output")
+    exported = common.load_policy(tmp_path / "run" / "best_policy.pt2").state_dict()
+    assert exported and all(torch.equal(value, best[name]) for name, value in exported.items())
 
 
 def test_stop_and_continue(script, reference, tmp_path):

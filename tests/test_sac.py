@@ -521,8 +521,9 @@ def train(path, **choices):
     with pytest.MonkeyPatch.context() as patch:
         for name in ("update", "fit_scaling"):
             patch.setattr(SACAgent, name, recorded(name))
+        torch.set_num_threads(2)
         returned = sac_minitaur.train(Config(**TINY | {"run_dir": str(path)} | choices))
-    assert returned == path
+    assert returned == path and torch.get_num_threads() == 1
     return path, calls
 
 
