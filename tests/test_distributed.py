@@ -117,6 +117,30 @@ def trained(request, tmp_path_factory):
     return path / "run", ranks, world_size
 
 
+@pytest.fixture(scope="module", params=SCRIPTS)
+def stopped(request, tmp_path_factory):
+    """A run of two processes, two environments each, of which the second alone was asked to stop; its directory."""
+    path = tmp_path_factory.mktemp(f"stopped_{request.param}")
+    more = ["--num-envs", 2, "--num-iterations", 10**6, "--replay-buffer-capacity", 10**6]
+    ranks = start_ranks(2, request.param, flags(request.param, path / "run", *more), path / "output")
+    wait_until((path / "run" / "train.csv").exists, seconds=600)
+    ranks[1].kill(signal.SIGTERM)
+    end(ranks)
+    return path / "run"
+
+
+def test_all_ranks_stop_with_one(stopped):
+    state = checkpoint(stopped)
+    assert 0 < state["shared"]["step"] < 10**6 and len(state["ranks"]) == 2
+
+
+def test_every_rank_has_experience_of_its_own(stopped):
+    ranks = checkpoint(stopped)["ranks"]
+    first = [tuple(row[:3].tolist()) for own in ranks for row in own["buffer"]["rows"][:2]]
+    assert len(set(first)) == 4  # the first observations of the four environments
+    assert not torch.equal(*(own["random"]["cpu"] for own in ranks))
+
+
 def test_parameters_are_the_same_on_all_ranks(trained):
     """To the last bit after 200 updates, although each has experience of its own."""
     run_dir, _, world_size = trained
