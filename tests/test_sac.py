@@ -753,7 +753,7 @@ def test_evaluation_episodes_are_none_of_trainings():
 def test_learns_pendulum(tmp_path):
     path, _ = train(
         tmp_path / "run",
-        num_iterations=4000,
+        num_iterations=5000,
         initial_collect_steps=1000,
         batch_size=128,
         actor_learning_rate=1e-3,
@@ -763,16 +763,15 @@ def test_learns_pendulum(tmp_path):
         actor_layers=(64, 64),
         critic_layers=(64, 64),
         log_interval=1000,
-        eval_interval=4000,
-        checkpoint_interval=4000,
+        eval_interval=5000,
+        checkpoint_interval=5000,
         num_eval_episodes=10,
     )
     random_return = read_csv(path / "random.csv")[0]["average_return"]
     rows = read_csv(path / "eval.csv")
-    assert [row["step"] for row in rows] == [0, 4000]
+    assert [row["step"] for row in rows] == [0, 5000]
     assert random_return < -700 and rows[0]["average_return"] < -700
-    # A pendulum kept upright from the first swing on has about −150. Seven of eight seeds had −119 to −193 here, one −316.
-    assert rows[1]["average_return"] > -400
+    assert rows[1]["average_return"] > -300  # a pendulum kept upright from the first swing on has about −150
 
 
 # What the user can get wrong
