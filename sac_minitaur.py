@@ -58,6 +58,9 @@ class Config:
     """Adam's ε (Keras' default, which the tutorials leave unsaid)"""
     adam_beta1: float = 0.5
     """ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient"""
+    privileged_critics: bool = True
+    """ours (theirs: no): the critics see what the task's observation lacks, where the environment tells (the Minitaur's
+    velocity and height). The actor does not, so that the policy needs no more than the task gives (arXiv:1710.06542)"""
     critic_batch_norm: bool = True
     """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
     (arXiv:1902.05605): what is learned is then worth something a step later, not a fifth of the run"""
@@ -193,6 +196,7 @@ class MinitaurBulletEnv(gym.Env):
         max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT
         high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01
         self.observation_space = gym.spaces.Box(np.float32(-high), np.float32(high))
+        self.privileged_space = gym.spaces.Box(-np.inf, np.inf, (7,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (8,), np.float32)
 
     def reset(self, *, seed=None, options=None):
@@ -307,6 +311,13 @@ class MinitaurBulletEnv(gym.Env):
             (self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32, casting="same_kind"
         )
 
+    def privileged_observation(self):
+        """What the observation lacks, (7,) float32: the base's velocity in m/s and angular velocity in rad/s, both in
+        its own frame (forwards, to its left, up), and its height in m."""
+        velocity, angular_velocity = self.simulator.getBaseVelocity(self.robot)
+        rotation = np.reshape(self.simulator.getMatrixFromQuaternion(self.orientation), (3, 3))
+        return np.concatenate((velocity @ rotation, angular_velocity @ rotation, self.position[2:]), dtype=np.float32)
+
     def render(self):
         """The robot from the side that it runs past, (360, 480, 3) uint8, from pybullet's software renderer."""
         simulator = self.simulator
@@ -360,12 +371,29 @@ def make_env(env_id, **kwargs):
     return env
 
 
-def make_training_env(env_id):
-    """The task with flat observations and actions in [-1, 1], as the agent sees it."""
+class AppendPrivileged(gym.ObservationWrapper):
+    """Ends every observation (O,) with the environment's `privileged_observation()` (P,), which only critics see."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        own, privileged = env.observation_space, env.unwrapped.privileged_space
+        self.observation_space = gym.spaces.Box(np.append(own.low, privileged.low), np.append(own.high, privileged.high))
+
+    def observation(self, observation):
+        return np.append(observation, self.unwrapped.privileged_observation())
+
+
+def make_training_env(env_id, privileged):
+    """The task with flat observations and actions in [-1, 1], as the agent sees it in training.
+
+    With `privileged` the observations end with what only the critics see, where the environment has that.
+    """
     env = make_env(env_id)
     if (env.action_space.low != -1).any() or (env.action_space.high != 1).any():
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    return env if len(env.observation_space.shape) == 1 else gym.wrappers.FlattenObservation(env)
+    if len(env.observation_space.shape) != 1:
+        env = gym.wrappers.FlattenObservation(env)
+    return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
 
 
 # The networks
@@ -414,7 +442,10 @@ def mlp(inputs, hidden_layers, outputs, normalization=None):
 
 
 class ObservationScaling(nn.Module):
-    """Standardizes observations (…, O) by a fixed mean and spread, clipped to ±10; the identity until `fit`."""
+    """Standardizes observations (…, S) by a fixed mean and spread, clipped to ±10; the identity until `fit`.
+
+    Those that end earlier, without what only the critics see, are scaled as far as they go.
+    """
 
     def __init__(self, observation_size):
         super().__init__()
@@ -423,7 +454,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("limit", torch.tensor(torch.inf))
 
     def fit(self, observations, ranks):
-        """Takes mean and spread from observations (N, O), over all ranks."""
+        """Takes mean and spread from observations (N, S), over all ranks."""
         mean = ranks.mean(observations.mean(0))
         variance = ranks.mean((observations - mean).square().mean(0))
         self.mean.copy_(mean)
@@ -432,19 +463,21 @@ class ObservationScaling(nn.Module):
         self.limit.fill_(10.0)
 
     def forward(self, observation):
-        return ((observation - self.mean) / self.std).clamp(-self.limit, self.limit)
+        size = observation.shape[-1]
+        return ((observation - self.mean[:size]) / self.std[:size]).clamp(-self.limit, self.limit)
 
 
 class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1)."""
+    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O numbers of an observation."""
 
     def __init__(self, observation_size, action_size, hidden_layers):
         super().__init__()
+        self.observation_size = observation_size
         self.net = mlp(observation_size, hidden_layers, 2 * action_size)
 
     def forward(self, observation):
-        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O)."""
-        mean, log_std = self.net(observation).chunk(2, dim=-1)
+        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O or more)."""
+        mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
         return mean, log_std.clamp(-20, 2)
 
     def sample(self, observation):
@@ -471,7 +504,7 @@ class TwinCritics(nn.Module):
         self.q2 = mlp(inputs, hidden_layers, 1, normalization)
 
     def forward(self, observation, action):
-        """(2, …) for scaled observations (…, O) and actions (…, A)."""
+        """(2, …) for scaled observations (…, S) and actions (…, A)."""
         x = torch.cat((observation, action), dim=-1)
         return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
 
@@ -583,19 +616,24 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
 
 
 class SACAgent:
-    """Actor, twin critics with their targets, and the temperature α, with their optimizers."""
+    """Actor, twin critics with their targets, and the temperature α, with their optimizers.
 
-    def __init__(self, config, observation_space, action_space, device, ranks):
+    The observations that it learns from, of `state_size` numbers, begin with the task's, of O, which are all that the
+    actor sees; by default that is all there is.
+    """
+
+    def __init__(self, config, observation_space, action_space, device, ranks, state_size=None):
         self.config, self.device, self.ranks = config, device, ranks
         self.action_shape = action_space.shape
-        self.observation_size = observation_size = math.prod(observation_space.shape)
+        observation_size = math.prod(observation_space.shape)
+        self.state_size = state_size = state_size or observation_size
         self.action_size = action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
-        self.scaling = ObservationScaling(observation_size).to(device)
+        self.scaling = ObservationScaling(state_size).to(device)
         self.reward_scale = torch.tensor(config.reward_scale_factor, device=device)
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
-        self.critics = TwinCritics(observation_size, action_size, config.critic_layers, normalization).to(device)
+        self.critics = TwinCritics(state_size, action_size, config.critic_layers, normalization).to(device)
         # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
@@ -623,7 +661,7 @@ class SACAgent:
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     def fit_scaling(self, observations, returns):
-        """Fixes the scales of observations (N, O) and rewards, by their n-step returns (N,), of all ranks' first data."""
+        """Fixes the scales of observations (N, S) and rewards, by their n-step returns (N,), of all ranks' first data."""
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.reward_scaling:
@@ -633,7 +671,7 @@ class SACAgent:
 
     @torch.no_grad()
     def act(self, observations, sampled):
-        """Actions (K, *action shape) in [-1, 1] for flat observations (K, O), numpy to numpy.
+        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), numpy to numpy.
 
         They are drawn from the policy where `sampled` (K,) is true; elsewhere they are the averaged actor's mean.
         """
@@ -784,12 +822,14 @@ def train(config):
     with common.Run(config, "sac_minitaur", evaluate) as run:
         ranks, saved = run.ranks, run.checkpoint
         episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
-        envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=True))
+        make_one = partial(make_training_env, config.env_id, config.privileged_critics)
+        envs = run.enter(episodes.open_envs(make_one, in_workers=True))
         torch.manual_seed(config.seed)  # the same networks on every rank
-        agent = SACAgent(config, observation_space, action_space, run.device, ranks)
+        state_size = envs.single_observation_space.shape[0]
+        agent = SACAgent(config, observation_space, action_space, run.device, ranks, state_size)
         buffer = ReplayBuffer(
             config.replay_buffer_capacity,
-            *(agent.observation_size, agent.action_size),
+            *(agent.state_size, agent.action_size),
             *(config.n_step, config.gamma, config.num_envs),
             run.device,
         )

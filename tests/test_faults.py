@@ -428,7 +428,7 @@ class NanReward(gym.RewardWrapper):
 
 def with_nan_rewards(module):
     make_training_env = module.make_training_env
-    module.make_training_env = lambda env_id: NanReward(make_training_env(env_id))
+    module.make_training_env = lambda *args: NanReward(make_training_env(*args))
 
 
 def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811
