@@ -57,14 +57,14 @@ def environment_candidates():
 
 def update_candidates():
     config, cpu = sac_minitaur.Config(), torch.device("cpu")
-    buffer = sac_minitaur.ReplayBuffer(100_000, 28, 8, config.n_step, config.gamma, config.num_envs, cpu)
+    buffer = sac_minitaur.ReplayBuffer(100_000, 35, 8, config.n_step, config.gamma, config.num_envs, cpu)
     buffer.rows.normal_()
-    buffer.rows[:, 37] = config.gamma**config.n_step  # nothing terminates
+    buffer.rows[:, 35 + 8 + 1] = config.gamma**config.n_step  # nothing terminates
     buffer.size = 100_000
 
     def new_agent(config):
         spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
-        return sac_minitaur.SACAgent(config, *spaces, cpu, common.Ranks())
+        return sac_minitaur.SACAgent(config, *spaces, cpu, common.Ranks(), state_size=35)
 
     def update(agent, num_threads):
         torch.set_num_threads(num_threads)

@@ -302,6 +302,47 @@ def test_the_last_reward_is_all_that_its_environment_adds(env):
         assert other.spec.reward_threshold == 15.0 and other.spec.max_episode_steps == 1000
 
 
+def test_what_only_critics_see_is_all_that_training_adds(env):
+    assert sac_minitaur.make_training_env(ENV_ID, privileged=False).observation_space == env.observation_space
+    with contextlib.closing(sac_minitaur.make_training_env(ENV_ID, privileged=True)) as training_env:
+        assert training_env.observation_space.shape == (28 + 7,)
+        observation, _ = env.reset(seed=3)
+        extended, _ = training_env.reset(seed=3)
+        assert extended.dtype == np.float32 and extended[:28].tolist() == observation.tolist()
+        for step in range(60):
+            action = trot(step).astype(np.float32)
+            observation, *rest = env.step(action)
+            extended, *other_rest = training_env.step(action)
+            assert other_rest == rest
+            assert extended.dtype == np.float32 and extended[:28].tolist() == observation.tolist()
+            assert extended in training_env.observation_space
+
+
+def test_privileged_observation_is_in_the_bodys_own_frame(env):
+    """With the robot turned to its left by 90 degrees, what moves along the world's y moves forwards."""
+    env.reset(seed=3)
+    minitaur = env.unwrapped
+    simulator, robot = minitaur.simulator, minitaur.robot
+    orientation = simulator.getQuaternionFromEuler((0, 0, math.pi / 2))
+    simulator.resetBasePositionAndOrientation(robot, (1, 2, 5), orientation)
+    minitaur._observation()
+    simulator.resetBaseVelocity(robot, (-2, 1, 3), (-5, 4, 6))
+    privileged = minitaur.privileged_observation()
+    assert privileged.dtype == np.float32
+    np.testing.assert_allclose(privileged, [1, 2, 3, 4, 5, 6, 5], atol=1e-6)
+
+
+def test_forward_velocity_is_the_way_by_the_time(env):
+    env.reset(seed=3)
+    start, velocities = env.unwrapped.x, []
+    for step in range(200):
+        env.step(trot(step).astype(np.float32))
+        velocities.append(env.unwrapped.privileged_observation()[0])
+    assert env.unwrapped.x - start > 0.2
+    # Every fifth of its moments is seen, and it walks nearly straight.
+    assert np.mean(velocities) * 2.0 == pytest.approx(env.unwrapped.x - start, rel=0.15)
+
+
 # What other programs see
 
 

@@ -279,6 +279,7 @@ def test_minitaur_resumes_exactly(tmp_path):
     assert run.wait() == -signal.SIGKILL
     state = checkpoint(tmp_path / "run")
     assert state["shared"]["step"] == 40 and len(state["ranks"][0]["episodes"]["actions"][0]) > 0  # in mid-episode
+    assert state["shared"]["agent"]["critics"]["q1.1.weight"].shape[1] == 28 + 7 + 8  # what only they see among it
     finish("sac_minitaur", ["--resume", tmp_path / "run"], tmp_path / "3")
     assert_same_run(tmp_path / "run", tmp_path / "whole")
 

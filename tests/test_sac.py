@@ -23,6 +23,7 @@ from sac_minitaur import Actor, Config, ObservationScaling, Policy, ReplayBuffer
 
 ROOT = Path(__file__).parent.parent
 TUTORIALS = dict(
+    privileged_critics=False,
     observation_scaling=False,
     reward_scaling=False,
     critic_batch_norm=False,
@@ -37,12 +38,12 @@ TUTORIALS = dict(
 )
 
 
-def make_agent(observation_size=3, action_size=2, device="cpu", **choices):
+def make_agent(observation_size=3, action_size=2, device="cpu", state_size=None, **choices):
     torch.manual_seed(0)
     config = Config(**{"actor_layers": (16, 16), "critic_layers": (16, 16)} | choices)
     observation_space = gym.spaces.Box(-np.inf, np.inf, (observation_size,))
     action_space = gym.spaces.Box(-1, 1, (action_size,))
-    return SACAgent(config, observation_space, action_space, torch.device(device), common.Ranks())
+    return SACAgent(config, observation_space, action_space, torch.device(device), common.Ranks(), state_size)
 
 
 def make_batch(size=32, observation_size=3, action_size=2):
@@ -178,6 +179,8 @@ def test_observation_scaling():
     # The third never moved; its spread counts as 0.01.
     near = scaling(torch.tensor([[2.0, 20.0, 7.02]]))
     torch.testing.assert_close(near, torch.tensor([[0.0, 0.0, 2.0]]), atol=1e-3, rtol=0)
+    # Without what only the critics see.
+    assert torch.equal(scaling(observations[:, :2]), scaling(observations)[:, :2])
     other = ObservationScaling(3)
     other.load_state_dict(scaling.state_dict())
     assert torch.equal(other(far), scaling(far))
@@ -387,6 +390,21 @@ def test_act_samples_or_takes_the_mean():
     torch.testing.assert_close(actions[1:3], agent.policy(observations)[1:3].detach())
 
 
+def test_only_the_critics_see_the_end_of_a_longer_observation():
+    agent = make_agent(observation_size=3, state_size=5)
+    agent.fit_scaling(7 + 2 * torch.randn(50, 5), torch.randn(50))
+    agent.update(make_batch(observation_size=5))
+    observations = torch.randn(4, 5)
+    others = torch.cat((observations[:, :3], torch.randn(4, 2)), dim=1)
+    for sampled in (np.ones(4, bool), np.zeros(4, bool)):
+        torch.manual_seed(7)
+        actions = agent.act(observations.numpy(), sampled)
+        torch.manual_seed(7)
+        assert (agent.act(others.numpy(), sampled) == actions).all()
+    torch.testing.assert_close(agent.policy(observations[:, :3]), torch.from_numpy(actions))
+    assert (agent.critics(observations, torch.zeros(4, 2)) != agent.critics(others, torch.zeros(4, 2))).all()
+
+
 @pytest.mark.parametrize("target_entropy, direction", [(10.0, 1), (-10.0, -1)])
 def test_alpha_moves_towards_the_target_entropy(target_entropy, direction):
     agent = make_agent(target_entropy_per_action=target_entropy)
@@ -425,7 +443,7 @@ def test_the_tutorials_values_are_the_defaults():
 
 
 def test_the_tutorials_exact_choices_are_flags():
-    flags = """--no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
+    flags = """--no-privileged-critics --no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
         --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
         --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
     assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
@@ -484,8 +502,18 @@ class StepCounter(gym.Env):
         return observation, float(self.step_number), self.terminates and self.step_number == 4, False, {}
 
 
+class Telling(StepCounter):
+    """Tells the critics 100 more than the number of the step."""
+
+    privileged_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+
+    def privileged_observation(self):
+        return np.float32([100 + self.step_number])
+
+
 # Named with the module, so that worker processes that are not forked find them too.
 gym.register("Truncated-v0", entry_point=StepCounter, max_episode_steps=4)
+gym.register("Telling-v0", entry_point=Telling, max_episode_steps=4)
 gym.register("Terminated-v0", entry_point=StepCounter, kwargs={"terminates": True})
 
 TINY = dict(
@@ -681,6 +709,23 @@ def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
     for i in range(num_envs):
         count = torch.arange(len(rows[i::num_envs]))
         assert torch.equal(observations[i::num_envs], torch.stack((1 + count // 4, count % 4), 1).float())
+
+
+@pytest.mark.parametrize("privileged", [True, False])
+def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path, privileged):
+    choices = {"n_step": 1, "initial_collect_steps": 40, "privileged_critics": privileged}
+    path, _ = train(tmp_path / "run", env_id=f"{__name__}:Telling-v0", **choices)
+    shared, own = read_checkpoint(path)
+    size = 3 if privileged else 2
+    observations, _, rewards, _, next_observations = own["buffer"]["rows"].split((size, 1, 1, 1, size), dim=1)
+    assert torch.equal(next_observations[:, 1:2], rewards)
+    if privileged:  # of the step that each observation is of, to the very end of an episode
+        assert torch.equal(observations[:, 2], 100 + observations[:, 1])
+        assert torch.equal(next_observations[:, 2], 100 + next_observations[:, 1])
+    assert shared["agent"]["critics"]["q1.1.weight"].shape == (16, size + 1)
+    assert shared["agent"]["actor"]["net.0.weight"].shape == (16, 2)
+    policy = torch.export.load(path / "policy.pt2").module()
+    assert policy(torch.zeros(1, 2)).shape == (1, 1)
 
 
 # Exported policies
