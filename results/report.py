@@ -17,13 +17,16 @@ FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_minitaur": "ours", "sac_minitaur_last_reward": "ours, last reward observed"},
+        {"sac_minitaur": "ours", "sac_unprivileged": "ours, critics that see no more than the actor"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "sac_minitaur_long": (
         "SAC on the Minitaur, continued",
         15.0,
-        {"sac_minitaur_long": "ours", "sac_minitaur_last_reward_long": "ours, last reward observed"},
+        {
+            "sac_unprivileged_long": "critics that see no more than the actor",
+            "sac_minitaur_last_reward_long": "that, last reward observed",
+        },
         (),
     ),
     "dqn_cartpole": (
@@ -82,18 +85,18 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_ablation(experiment, step):
-    """Returns after `step` updates of `<experiment>` and of all `<experiment>_without_…`, with the seeds that these ran."""
-    names = sorted(path.name for path in RESULTS.glob(f"{experiment}_without_*"))
-    curves = {name: runs(name) for name in (experiment, *names)}
-    seeds = sorted(set().union(*(curves[name] for name in names)))
-    print(f"\n### At {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
+def print_ablation(step):
+    """Returns after `step` updates of the default, and of the runs without one choice or two, with the seeds of these."""
+    names = {"nothing": "sac_minitaur", "privileged_critics": "sac_unprivileged"}
+    for path in sorted(RESULTS.glob("sac_unprivileged_without_*")):
+        names[f"privileged_critics and {path.name.removeprefix('sac_unprivileged_without_')}"] = path.name
+    curves = {label: runs(name) for label, name in names.items()}
+    seeds = sorted(set.intersection(*map(set, curves.values())))
+    print(f"\n### At {step}, without some choices\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
     print(f"|{' --- |' * (len(seeds) + 2)}")
-    for name, evaluations in curves.items():
-        at = {seed: row["average_return"] for seed, rows in evaluations.items() for row in rows if row["step"] == step}
-        returns = [at[seed] for seed in seeds if seed in at]
-        choice = name.removeprefix(experiment).removeprefix("_without_") or "nothing"
-        print(f"| {choice} | {' | '.join(number(at.get(seed, math.nan)) for seed in seeds)} | {median(returns):.2f} |")
+    for label, evaluations in curves.items():
+        returns = [row["average_return"] for seed in seeds for row in evaluations[seed] if row["step"] == step]
+        print(f"| {label} | {' | '.join(map(number, returns))} | {median(returns):.2f} |")
 
 
 def draw(name, title, threshold, ours, published):
@@ -123,7 +126,7 @@ def main():
     for path in sorted(RESULTS.glob("sac*")):
         if path.is_dir() and "_without_" not in path.name:
             print_table(path.name, goal=15, late=50_000)
-    print_ablation("sac_minitaur", step=30_000)
+    print_ablation(step=30_000)
     for path in sorted(RESULTS.glob("dqn*")):
         if path.is_dir():
             print_table(path.name, goal=475 if "_v1" in path.name else 200, late=10_000)
