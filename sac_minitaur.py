@@ -1,7 +1,6 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
     python sac_minitaur.py                                    # about half an hour on two CPU cores, return about 15
-    python sac_minitaur.py --env-id MinitaurLastRewardEnv-v0  # the robot sees its last reward too, and learns much faster
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy
@@ -332,30 +331,10 @@ class MinitaurBulletEnv(gym.Env):
             self.simulator.disconnect()
 
 
-class MinitaurLastRewardEnv(MinitaurBulletEnv):
-    """The same robot and task; the observation (29,) ends with the reward of the last step, per second (at first 0).
-
-    How fast the body moves is not in the original's observation, so that states of very different worth look alike.
-    The reward tells: it is a speed, less a part of the power that the observation holds.
-    """
-
-    def __init__(self, render_mode=None):
-        super().__init__(render_mode)
-        low, high = self.observation_space.low, self.observation_space.high
-        self.observation_space = gym.spaces.Box(np.append(low, np.float32(-np.inf)), np.append(high, np.float32(np.inf)))
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = super().reset(seed=seed, options=options)
-        return np.append(observation, np.float32(0)), info
-
-    def step(self, action):
-        observation, reward, *rest = super().step(action)
-        return np.append(observation, np.float32(reward / (self.SUBSTEPS * self.SUBSTEP_SECONDS))), reward, *rest
-
-
-for _id, _env in (("MinitaurBulletEnv-v0", MinitaurBulletEnv), ("MinitaurLastRewardEnv-v0", MinitaurLastRewardEnv)):
-    if _id not in gym.registry:
-        gym.register(id=_id, entry_point=_env, max_episode_steps=1000, reward_threshold=15.0)
+if "MinitaurBulletEnv-v0" not in gym.registry:
+    gym.register(
+        id="MinitaurBulletEnv-v0", entry_point=MinitaurBulletEnv, max_episode_steps=1000, reward_threshold=15.0
+    )
 
 
 def make_env(env_id, **kwargs):
