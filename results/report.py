@@ -85,14 +85,13 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_ablation(step):
-    """Returns after `step` updates of the default, and of the runs without one choice or two, with the seeds of these."""
-    names = {"nothing": "sac_minitaur", "privileged_critics": "sac_unprivileged"}
-    for path in sorted(RESULTS.glob("sac_unprivileged_without_*")):
-        names[f"privileged_critics and {path.name.removeprefix('sac_unprivileged_without_')}"] = path.name
-    curves = {label: runs(name) for label, name in names.items()}
+def print_ablation(base, step, more):
+    """Returns after `step` updates of `base`, of the runs without one choice, and of `more`, with the seeds of all."""
+    without = f"{base}_without_"
+    names = {path.name.removeprefix(without): path.name for path in sorted(RESULTS.glob(f"{without}*"))}
+    curves = {label: runs(name) for label, name in ({"nothing": base} | names | more).items()}
     seeds = sorted(set.intersection(*map(set, curves.values())))
-    print(f"\n### At {step}, without some choices\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
+    print(f"\n### {base} at {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
     print(f"|{' --- |' * (len(seeds) + 2)}")
     for label, evaluations in curves.items():
         returns = [row["average_return"] for seed in seeds for row in evaluations[seed] if row["step"] == step]
@@ -126,7 +125,9 @@ def main():
     for path in sorted(RESULTS.glob("sac*")):
         if path.is_dir() and "_without_" not in path.name:
             print_table(path.name, goal=15, late=50_000)
-    print_ablation(step=30_000)
+    exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
+    print_ablation("sac_minitaur", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
+    print_ablation("sac_unprivileged", 30_000, {})
     for path in sorted(RESULTS.glob("dqn*")):
         if path.is_dir():
             print_table(path.name, goal=475 if "_v1" in path.name else 200, late=10_000)
