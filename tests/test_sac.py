@@ -456,25 +456,39 @@ def test_the_tutorials_exact_choices_are_flags():
     assert agent.target_critics and not make_agent().target_critics
 
 
+@pytest.mark.parametrize("choices", [{}, TUTORIALS])
+def test_an_update_reads_and_creates_nothing_on_another_device(monkeypatch, choices):
+    """On the meta device, whose tensors have no numbers: one of the CPU in between them is an error, as on a GPU."""
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda *args, **kwargs: adam(*args, **kwargs | {"fused": False}))
+    agent = make_agent(device="meta", state_size=5, **choices)
+    buffer = ReplayBuffer(40, 5, 2, 3, 0.99, 1, agent.device)
+    buffer.size = 40
+    agent.fit_scaling(*buffer.observations_and_returns())
+    metrics = agent.update(buffer.sample(32))
+    assert {value.device for value in metrics.values()} == {agent.device}
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
-def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch):
+@pytest.mark.parametrize("choices", [{}, TUTORIALS])
+def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
     generator = torch.Generator().manual_seed(3)
     noise = [torch.randn(32, 2, generator=generator) for _ in range(2)]
-    agents = [make_agent(device=device, adam_epsilon=1e-2) for device in ("cpu", "cuda")]
+    agents = [make_agent(device=device, state_size=5, **choices | {"adam_epsilon": 1e-2}) for device in ("cpu", "cuda")]
     agents[1].load_state(agents[0].state())  # each device has a generator of its own
     results = []
     for agent in agents:
         draws = iter(noise)
         monkeypatch.setattr(torch, "randn_like", lambda mean: next(draws).to(mean.device))
-        batch = tuple(tensor.to(agent.device) for tensor in make_batch())
+        batch = tuple(tensor.to(agent.device) for tensor in make_batch(observation_size=5))
         agent.fit_scaling(batch[0], batch[2])
         metrics = agent.update(batch)
         state = agent.state()
         results.append({name: value.cpu() for name, value in metrics.items()})
         results[-1] |= {
             f"{name}.{key}": value.cpu()
-            for name in ("actor", "critics", "target_critics")
-            for key, value in state[name].items()
+            for name in ("actor", "averaged_actor", "critics", "target_critics")
+            for key, value in state.get(name, {}).items()
         }
     torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)
 
