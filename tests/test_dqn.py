@@ -34,10 +34,10 @@ TINY = Config(
 )
 
 
-def make_agent(**changes):
+def make_agent(device="cpu", **changes):
     with dqn_cartpole.make_env("CartPole-v0") as env:
         config = dataclasses.replace(TINY, **changes)
-        return DQNAgent(config, env.observation_space, env.action_space, CPU, common.Ranks())
+        return DQNAgent(config, env.observation_space, env.action_space, torch.device(device), common.Ranks())
 
 
 def random_batch(size=16):
@@ -329,6 +329,31 @@ def tensors(tree):
         return [tree]
     values = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, (list, tuple)) else ()
     return [tensor for value in values for tensor in tensors(value)]
+
+
+def test_an_update_reads_and_creates_nothing_on_another_device(monkeypatch):
+    """On the meta device, whose tensors have no numbers: one of the CPU in between them is an error, as on a GPU."""
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda *args, **kwargs: adam(*args, **kwargs | {"fused": False}))
+    agent = make_agent("meta")
+    buffer = ReplayBuffer(40, 4, agent.device)
+    buffer.size = 40
+    agent.fit_offset(buffer.rewards())
+    metrics = agent.update(buffer.sample(16), largest_reward=1.0)
+    assert {value.device for value in metrics.values()} == {agent.device}
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_updates_on_the_gpu_are_those_of_the_cpu():
+    batches = [random_batch() for _ in range(5)]
+    agents = [make_agent(d, adam_epsilon=1e-2) for d in ("cpu", "cuda")]
+    agents[1].load_state(agents[0].state())
+    for agent in agents:
+        agent.fit_offset(batches[0][2].to(agent.device))
+        for batch in batches:
+            metrics = agent.update([tensor.to(agent.device) for tensor in batch], largest_reward=1.0)
+        agent.results = {name: value.cpu() for name, value in (metrics | agent.q_network.state_dict()).items()}
+    torch.testing.assert_close(agents[1].results, agents[0].results, rtol=1e-3, atol=1e-4)
 
 
 # Training
