@@ -49,6 +49,10 @@ def runs(experiment):
     return dict(sorted((int(path.parent.name.removeprefix("seed")), read(path)) for path in paths))
 
 
+def returns_by_step(rows):
+    return {row["step"]: row["average_return"] for row in rows}
+
+
 def tutorials():
     """The tutorials' evaluations: run → (steps, returns)."""
     curves = {}
@@ -70,13 +74,13 @@ def print_table(experiment, goal, late):
     print(f"\n### {experiment}\n\n| seed | {columns} |\n|{' --- |' * 8}")
     summary = []
     for seed, rows in runs(experiment).items():
-        at = {row["step"]: row["average_return"] for row in rows}
+        at = returns_by_step(rows)
         early, later = (at.get(step, math.nan) for step in (10_000, 20_000))
         final, length = rows[-1]["average_return"], rows[-1]["average_episode_length"]
-        best = max(row["average_return"] for row in rows)
-        worst = min((row["average_return"] for row in rows if row["step"] >= late), default=math.nan)
+        best = max(at.values())
+        worst = min((value for step, value in at.items() if step >= late), default=math.nan)
         # An untrained network may balance by luck (DQN's seed 4).
-        first = next((row["step"] for row in rows if row["step"] > 0 and row["average_return"] >= goal), math.inf)
+        first = next((step for step, value in at.items() if step > 0 and value >= goal), math.inf)
         summary.append((early, later, final, length, best, worst, first))
         spread = f"{final:.2f} ± {rows[-1]['std_return']:.2f}"
         print(f"| {seed} | {number(early)} | {number(later)} | {spread} | {length:.0f}", end="")
@@ -94,7 +98,7 @@ def print_ablation(base, step, more):
     print(f"\n### {base} at {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
     print(f"|{' --- |' * (len(seeds) + 2)}")
     for label, evaluations in curves.items():
-        returns = [row["average_return"] for seed in seeds for row in evaluations[seed] if row["step"] == step]
+        returns = [returns_by_step(evaluations[seed])[step] for seed in seeds]
         print(f"| {label} | {' | '.join(map(number, returns))} | {median(returns):.2f} |")
 
 
@@ -103,11 +107,10 @@ def draw(name, title, threshold, ours, published):
     axes = figure.subplots()
     for color, (experiment, label) in zip(("C0", "C2"), ours.items()):
         curves = runs(experiment)
-        for rows in curves.values():
-            returns = [r["average_return"] for r in rows]
-            axes.plot([r["step"] for r in rows], returns, color=color, linewidth=0.7, alpha=0.6)
-        steps = sorted(set.intersection(*({row["step"] for row in rows} for rows in curves.values())))
-        at = [{row["step"]: row["average_return"] for row in rows} for rows in curves.values()]
+        at = [returns_by_step(rows) for rows in curves.values()]
+        for returns in at:
+            axes.plot(list(returns), list(returns.values()), color=color, linewidth=0.7, alpha=0.6)
+        steps = sorted(set.intersection(*map(set, at)))
         middle = [median(returns[step] for returns in at) for step in steps]
         counted = f"median of {len(curves)} seeds (each thin)" if len(curves) > 1 else "one seed"
         axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, {counted}")
