@@ -807,11 +807,9 @@ def train(config):
         state_size = envs.single_observation_space.shape[0]
         agent = SACAgent(config, observation_space, action_space, run.device, ranks, state_size)
         buffer = ReplayBuffer(
-            config.replay_buffer_capacity,
-            *(agent.state_size, agent.action_size),
-            *(config.n_step, config.gamma, config.num_envs),
-            run.device,
-        )
+            config.replay_buffer_capacity, agent.state_size, agent.action_size, config.n_step, config.gamma,
+            config.num_envs, run.device,
+        )  # fmt: skip
         policy_file = common.PolicyFile(agent.policy, observation_space.shape)
         torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
         run.print_start(observation_space, action_space, buffer.rows.nbytes)
