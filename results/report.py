@@ -24,6 +24,7 @@ FIGURES = {
         "SAC on the Minitaur, continued",
         15.0,
         {
+            "sac_minitaur_long": "ours",
             "sac_unprivileged_long": "critics that see no more than the actor",
             "sac_minitaur_last_reward_long": "that, last reward observed",
         },
@@ -105,7 +106,7 @@ def print_ablation(base, step, more):
 def draw(name, title, threshold, ours, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    for color, (experiment, label) in zip(("C0", "C2"), ours.items()):
+    for color, (experiment, label) in zip(("C0", "C2", "C3"), ours.items()):
         curves = runs(experiment)
         at = [returns_by_step(rows) for rows in curves.values()]
         for returns in at:
