@@ -69,7 +69,7 @@ class Config:
     """ours (theirs: 1): Q changes by this where the network's output changes by 1. Adam moves an output at the pace of
     its learning rate, whatever the output's unit: for values tens apart, a unit of one reward is a long way"""
     value_bound: bool = True
-    """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth for ever"""
+    """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth, for ever or once"""
     advantage_learning: float = 0.9
     """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one. The other action
     comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's errors"""
@@ -314,7 +314,8 @@ class DQNAgent:
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
         # Where all states are worth the same, errors of extrapolation would add up: the mean Q grew to twice the bound.
-        bound = largest_reward / (1 - config.gamma) if config.value_bound else math.inf
+        # Where every reward is a cost, the best that can happen is that the episode ends.
+        bound = max(largest_reward, largest_reward / (1 - config.gamma)) if config.value_bound else math.inf
 
         both = self.scaling(torch.cat((observations, next_observations)))
         observations, next_observations = both.chunk(2)

@@ -77,7 +77,10 @@ def test_targets_do_not_exceed_the_bound():
 
 
 def test_bound_follows_the_largest_reward():
-    """Rewards of at most 1 bound targets to 1 / (1 − γ), a later reward of 3 to 3 / (1 − γ), also after a reload."""
+    """Rewards of at most 1 bound targets to 1 / (1 − γ), a later reward of 3 to 3 / (1 − γ), also after a reload.
+
+    Rewards of at most −1 bound them to −1: an episode may end with the next step.
+    """
     buffer = ReplayBuffer(2, 4, CPU)
     for reward in (1.0, 3.0, 2.0, 2.0):
         buffer.add(np.zeros((1, 4)), np.array([0]), np.array([reward]), np.array([False]), np.zeros((1, 4)))
@@ -85,7 +88,7 @@ def test_bound_follows_the_largest_reward():
     copy.load_state(buffer.state())
     assert copy.largest_reward == buffer.largest_reward == 3.0
     batch = torch.zeros(1, 4), torch.tensor([0]), torch.tensor([1.0]), torch.tensor([0.0]), torch.zeros(1, 4)
-    for largest, target in ((1.0, 2.0), (3.0, 6.0)):
+    for largest, target in ((1.0, 2.0), (3.0, 6.0), (-1.0, -1.0)):
         agent = make_agent(gamma=0.5)
         agent.value_offset += 100
         metrics = agent.update(batch, largest)
