@@ -5,6 +5,7 @@ Nothing here knows a network, a loss or a replay buffer.
 """
 
 import contextlib
+import copy
 import csv
 import ctypes
 import dataclasses
@@ -36,8 +37,8 @@ import torch.distributed as dist
 from tqdm import tqdm
 
 CHECKPOINT_FORMAT = 1
-# Fields of a config that a resumed run may change: they decide what is written and where, not what is learned.
-HARMLESS_FIELDS = ("run_dir", "resume", "evaluate", "video", "checkpoint_interval")
+# Fields of a config that a resumed run may change: they decide what is done besides, not what is learned.
+HARMLESS_FIELDS = ("resume", "evaluate", "video", "checkpoint_interval")
 # Sets the seeds of evaluation episodes apart from those of training, whose second number counts environments.
 EVALUATION_KEY = 2**32 - 1
 # Workers are forked where that is safe: they start at once and share the memory of the imported libraries. They never
@@ -149,7 +150,7 @@ def empty_replay(capacity, columns, device):
 
 def random_state():
     """The state of torch's generators, CPU and current GPU: a dict of byte tensors."""
-    return {"cpu": torch.get_rng_state()} | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_available() else {})
+    return {"cpu": torch.get_rng_state()} | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_initialized() else {})
 
 
 def set_random_state(state):
@@ -365,7 +366,9 @@ class Evaluations:
         self.evaluate, self.env_id, self.seeds, self.ranks = evaluate, env_id, seeds, ranks
         self.pending = deque()
         self.pool = ProcessPoolExecutor(
-            os.cpu_count(), multiprocessing.get_context(START_METHOD), initializer=_start_pool_worker
+            min(os.cpu_count(), math.ceil(len(seeds) / ranks.world_size)),
+            multiprocessing.get_context(START_METHOD),
+            initializer=_start_pool_worker,
         )
         # The first call forks the workers: now, before anything has used a GPU or started threads.
         self.pool.submit(int).result()
@@ -374,16 +377,15 @@ class Evaluations:
 
     def start(self, header, policy):
         """Starts evaluating a copy of `policy` (None: random actions), to be reported with `header`, a dict."""
-        if policy is not None:
-            policy = copy_to_cpu(policy)
+        policy = policy and copy_to_cpu(policy)
         share = self.seeds[self.ranks.rank :: self.ranks.world_size]
         futures = [self.submit(self.evaluate, policy, self.env_id, seed) for seed in share]
         self.pending.append((header, policy, futures))
 
     def submit(self, function, policy, *args):
-        """A future of `function(policy, *args)` in a worker."""
-        source = pickle.dumps(None if policy is None else copy_to_cpu(policy))
-        return self.pool.submit(_call_with_policy, function, source, *args)
+        """A future of `function(policy, *args)` in a worker, for a policy on the CPU or None."""
+        # Pickled here, by value: the pool's queue would send tensors as handles of shared memory.
+        return self.pool.submit(_call_with_policy, function, pickle.dumps(policy), *args)
 
     def finished(self):
         """Yields (header, policy, returns, lengths) of those that are done.
@@ -422,18 +424,13 @@ def _start_pool_worker():
         os.nice(5)  # training waits for its own physics, nothing waits for an evaluation
 
 
-@functools.lru_cache(maxsize=2)
-def _load_policy_source(source):
-    return pickle.loads(source)
-
-
-def _call_with_policy(function, source, *args):
-    return function(_load_policy_source(source), *args)
+def _call_with_policy(function, policy, *args):
+    return function(pickle.loads(policy), *args)
 
 
 def copy_to_cpu(module):
     """A copy of a module that shares nothing with it."""
-    return pickle.loads(pickle.dumps(module)).cpu()
+    return copy.deepcopy(module).cpu()
 
 
 class StopRequest:
@@ -509,7 +506,7 @@ class Run:
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
             self.checkpoint = shared | own
             for name, saved in self.checkpoint["config"].items():
-                if name not in (*HARMLESS_FIELDS, "num_iterations") and saved != getattr(config, name, None):
+                if name not in (*HARMLESS_FIELDS, "run_dir", "num_iterations") and saved != getattr(config, name, None):
                     raise InputError(f"{self.path}/checkpoint.pt is another run's: its {name} is {saved}")
         else:
             default = Path("runs") / f"{script}-{time.strftime('%Y%m%d-%H%M%S')}-seed{config.seed}"
@@ -582,9 +579,9 @@ class Run:
         write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
 
     def _rewrite_tables(self):
-        for path in [*self.path.glob("*.csv"), *self.path.glob("events.out.tfevents.*")]:
-            if path.stem not in self.tables:
-                path.unlink()
+        later = [self.path / f"{name}.csv" for name in ("train", "eval", "random") if name not in self.tables]
+        for path in [*later, *self.path.glob("events.out.tfevents.*")]:
+            path.unlink(missing_ok=True)
         for name, rows in self.tables.items():
             text = "".join(map(_csv_line, [rows[0].keys(), *(row.values() for row in rows)]))
             write_atomically(self.path / f"{name}.csv", lambda file, text=text: file.write(text.encode()))
@@ -715,7 +712,7 @@ class Run:
             seed = self.evaluations.seeds[0]
             videos = [
                 self.evaluations.submit(film, agent, self.config.env_id, seed, self.path / name)
-                for agent, name in ((policy, "trained_agent.mp4"), (None, "random_agent.mp4"))
+                for agent, name in ((copy_to_cpu(policy), "trained_agent.mp4"), (None, "random_agent.mp4"))
             ]
             for video in videos:
                 while not video.done() and not self.stop.requested:
@@ -903,9 +900,9 @@ def load_policy(path):
     """
     try:
         checked = io.BytesIO()
-        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(checked, "w") as copy:
+        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(checked, "w") as plain:
             for name in dict.fromkeys(archive.namelist()):
-                copy.writestr(name, _plain_record(name.partition("/")[2], archive.read(name)))
+                plain.writestr(name, _plain_record(name.partition("/")[2], archive.read(name)))
         checked.seek(0)
         logging.getLogger("torch.export").setLevel(logging.ERROR)  # it would log what is raised here in one line
         return torch.export.load(checked).module()

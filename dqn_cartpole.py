@@ -481,7 +481,7 @@ def train(config):
                     run.start_evaluation(step, env_steps, agent.policy)
             common.require_finite(step, metrics)
 
-            if env_steps // steps_per_round % 100 == 0:
+            if env_steps % 100 < steps_per_round:
                 run.report_evaluations(policy_file)
                 stopping = run.stop_requested()
             if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:

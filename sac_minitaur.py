@@ -595,13 +595,13 @@ class SACAgent:
         self.action_size = action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
         self.scaling = ObservationScaling(state_size).to(device)
-        self.reward_scale = torch.tensor(config.reward_scale_factor, device=device)
+        self.reward_scale = torch.tensor(float(config.reward_scale_factor), device=device)
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, normalization).to(device)
         # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_alpha = torch.tensor(config.initial_log_alpha, device=device, requires_grad=True)
+        self.log_alpha = torch.tensor(float(config.initial_log_alpha), device=device, requires_grad=True)
         self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.policy = Policy(self.scaling, self.averaged_actor, action_space).to(device)
 
@@ -853,7 +853,7 @@ def train(config):
             if exploring and env_steps >= config.initial_collect_steps:
                 agent.fit_scaling(*buffer.observations_and_returns())
                 run.start_evaluation(step, env_steps, agent.policy)
-            if env_steps // steps_per_round % 100 == 0:
+            if env_steps % 100 < steps_per_round:
                 run.report_evaluations(policy_file)
                 stopping = run.stop_requested()
             if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:

@@ -31,9 +31,9 @@ TUTORIALS = dict(
     n_step=1,
     averaged_actor_tau=1.0,
     mean_action_episodes=False,
-    initial_log_alpha=0.0,
+    initial_log_alpha=0,
     target_entropy_per_action=-0.5,
-    reward_scale_factor=1.0,
+    reward_scale_factor=1,
     replay_buffer_capacity=10_000,
 )
 
