@@ -455,8 +455,8 @@ def train(config):
         steps_per_round = config.num_envs * ranks.world_size
         observations, _ = envs.reset()
         while step < config.num_iterations and not stopping:
-            exploring = env_steps < config.initial_collect_steps
-            actions = agent.random_actions(config.num_envs) if exploring else agent.act(observations)
+            warming_up = env_steps < config.initial_collect_steps
+            actions = agent.random_actions(config.num_envs) if warming_up else agent.act(observations)
             next_observations, rewards, terminated, truncated, infos = envs.step(actions)
             env_steps += steps_per_round
             done = terminated | truncated
@@ -464,7 +464,7 @@ def train(config):
             episodes.record(actions, rewards, done)
             observations = next_observations
 
-            if exploring and env_steps >= config.initial_collect_steps:
+            if warming_up and env_steps >= config.initial_collect_steps:
                 agent.fit_offset(buffer.rewards())
                 run.start_evaluation(step, env_steps, agent.policy)
 

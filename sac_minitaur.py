@@ -71,8 +71,8 @@ class Config:
     """ours (theirs: 1): environment steps whose rewards a target sums before it bootstraps. One step of 0.01 s changes
     the return so little that the critics' errors hide it"""
     reward_scaling: bool = True
-    """ours (theirs: none): divide the rewards by the spread of the n-step returns in the initial random data, here
-    0.005: values of a thousandth are lost in the noise of new critics"""
+    """ours (theirs: none): divide the rewards by the standard deviation of the initial random data's n-step
+    returns, here 0.005: values of a thousandth are lost in the noise of new critics"""
     reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
     averaged_actor_tau: float = 0.005
@@ -92,7 +92,7 @@ class Config:
     critic_layers: tuple[int, ...] = (256, 256)
     """hidden units of each critic"""
     observation_scaling: bool = True
-    """ours (theirs: none): standardize observations by the mean and spread of the initial random data"""
+    """ours (theirs: none): standardize observations by mean and standard deviation of the initial random data"""
 
     seed: int = 0
     """source of all randomness"""
@@ -365,7 +365,7 @@ def make_training_env(env_id, privileged):
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Normalizes features (B, F) by mean and spread of the batch, all ranks' together; in `eval` mode by running ones.
+    """Normalizes features (B, F) by mean and variance of the batch, all ranks' together; in `eval` mode by running ones.
 
     Momentum and ε are CrossQ's.
     """
@@ -407,7 +407,7 @@ def mlp(inputs, hidden_layers, outputs, normalization=None):
 
 
 class ObservationScaling(nn.Module):
-    """Standardizes observations (…, S) by a fixed mean and spread, clipped to ±10; the identity until `fit`.
+    """Standardizes observations (…, S) by a fixed mean and standard deviation, clipped to ±10; the identity until `fit`.
 
     Those that end earlier, without what only the critics see, are scaled as far as they go.
     """
@@ -419,11 +419,11 @@ class ObservationScaling(nn.Module):
         self.register_buffer("limit", torch.tensor(torch.inf))
 
     def fit(self, observations, ranks):
-        """Takes mean and spread from observations (N, S), over all ranks."""
+        """Takes mean and standard deviation from observations (N, S), over all ranks."""
         mean = ranks.mean(observations.mean(0))
         variance = ranks.mean((observations - mean).square().mean(0))
         self.mean.copy_(mean)
-        # What hardly moves under random actions may move later: its spread is not taken for less than 0.01.
+        # What hardly moves under random actions may move later: its deviation is not taken for less than 0.01.
         self.std.copy_(variance.sqrt().clamp(min=0.01))
         self.limit.fill_(10.0)
 
@@ -502,8 +502,8 @@ class ReplayBuffer:
     left: n is then their number. Sampling is a single gather.
     """
 
-    def __init__(self, capacity, observation_size, action_size, n_step, gamma, num_envs, device):
-        self.sizes = (observation_size, action_size, 1, 1, observation_size)
+    def __init__(self, capacity, state_size, action_size, n_step, gamma, num_envs, device):
+        self.sizes = (state_size, action_size, 1, 1, state_size)
         self.n_step, self.gamma = n_step, gamma
         self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
@@ -511,7 +511,7 @@ class ReplayBuffer:
         self.incomplete = [deque() for _ in range(num_envs)]
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Takes a step of each of K environments: (K, O), (K, …), (K,), (K,), (K,), (K, O), as numpy arrays.
+        """Takes a step of each of K environments: (K, S), (K, …), (K,), (K,), (K,), (K, S), as numpy arrays.
 
         Stores the transitions that it completes, over the oldest when full.
         """
@@ -528,13 +528,13 @@ class ReplayBuffer:
                 self.size = min(self.size + 1, len(self.rows))
 
     def sample(self, batch_size):
-        """A batch drawn uniformly with replacement: (B, O), (B, A), (B,), (B,), (B, O)."""
+        """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
         indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
         observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
 
     def observations_and_returns(self):
-        """All that is stored of these: (size, O), (size,)."""
+        """All that is stored of these: (size, S), (size,)."""
         observations, _, returns, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return observations, returns.squeeze(1)
 
@@ -583,8 +583,8 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
 class SACAgent:
     """Actor, twin critics with their targets, and the temperature α, with their optimizers.
 
-    The observations that it learns from, of `state_size` numbers, begin with the task's, of O, which are all that the
-    actor sees; by default that is all there is.
+    The actor sees the task's observation, O numbers. The critics see S = `state_size` of them (by default the same):
+    first the task's, then what only they see.
     """
 
     def __init__(self, config, observation_space, action_space, device, ranks, state_size=None):
@@ -599,24 +599,20 @@ class SACAgent:
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, normalization).to(device)
-        # Batch normalization takes their place. (A tutorials' critic has no state but its parameters.)
+        # Batch normalization takes their place (CrossQ).
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(float(config.initial_log_alpha), device=device, requires_grad=True)
         self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.policy = Policy(self.scaling, self.averaged_actor, action_space).to(device)
 
-        self.critic_parameters = list(self.critics.parameters())
-        self.actor_parameters = [*self.actor.parameters(), self.log_alpha]
-        # After every update the first parameters of each move a step τ, the third, towards the second.
-        self.averages = [(list(self.averaged_actor.parameters()), self.actor_parameters[:-1], config.averaged_actor_tau)]
-        if self.target_critics:
-            targets = list(self.target_critics.parameters())
-            self.averages.append((targets, self.critic_parameters, config.target_update_tau))
+        self.actor_parameters, self.critic_parameters = list(self.actor.parameters()), list(self.critics.parameters())
+        self.averaged_parameters = list(self.averaged_actor.parameters())
+        self.target_parameters = list(self.target_critics.parameters()) if self.target_critics else []
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, who learn from the same sample of actions.
         groups = [
-            {"params": self.actor_parameters[:-1], "lr": config.actor_learning_rate},
+            {"params": self.actor_parameters, "lr": config.actor_learning_rate},
             {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
         ]
         self.actor_optimizer = torch.optim.Adam(groups, **adam)
@@ -631,8 +627,8 @@ class SACAgent:
             self.scaling.fit(observations, self.ranks)
         if self.config.reward_scaling:
             mean = self.ranks.mean(returns.mean())
-            spread = self.ranks.mean((returns - mean).square().mean()).sqrt()
-            self.reward_scale /= torch.where(spread > 1e-6, spread, 1.0)  # rewards that were all equal stay as they are
+            std = self.ranks.mean((returns - mean).square().mean()).sqrt()
+            self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
     def act(self, observations, sampled):
@@ -647,7 +643,7 @@ class SACAgent:
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
-        """One gradient step of the critics, then of the actor and α, then of what follows them slowly.
+        """One gradient step of the critics, then of the actor and α; the averages follow.
 
         `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
         number back here would make a GPU wait at every step.
@@ -677,11 +673,12 @@ class SACAgent:
         new_actions, log_probs = self.actor.sample(observations)
         loss_pi = actor_loss(log_probs, self.critics(observations, new_actions), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-        self._step(self.actor_optimizer, loss_pi + loss_alpha, self.actor_parameters)
+        self._step(self.actor_optimizer, loss_pi + loss_alpha, [*self.actor_parameters, self.log_alpha])
 
         with torch.no_grad():
-            for followers, parameters, tau in self.averages:
-                torch._foreach_lerp_(followers, parameters, tau)
+            torch._foreach_lerp_(self.averaged_parameters, self.actor_parameters, config.averaged_actor_tau)
+            if self.target_critics:
+                torch._foreach_lerp_(self.target_parameters, self.critic_parameters, config.target_update_tau)
         return {
             "critic_loss": loss_q.detach(),
             "actor_loss": loss_pi.detach(),
@@ -823,8 +820,8 @@ def train(config):
         steps_per_round = config.num_envs * ranks.world_size
         observations, _ = envs.reset()
         while step < config.num_iterations and not stopping:
-            exploring = env_steps < config.initial_collect_steps
-            if exploring:
+            warming_up = env_steps < config.initial_collect_steps
+            if warming_up:
                 actions = agent.random_actions(config.num_envs)
             else:
                 actions = agent.act(observations, sampled=episodes.even() | (not config.mean_action_episodes))
@@ -833,7 +830,7 @@ def train(config):
 
             metrics = {}
             updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
-            while not exploring and step < min(updates_due, config.num_iterations):
+            while not warming_up and step < min(updates_due, config.num_iterations):
                 metrics = agent.update(buffer.sample(config.batch_size // ranks.world_size))
                 step += 1
                 run.progress.update()
@@ -850,7 +847,7 @@ def train(config):
             observations = next_observations
             common.require_finite(step, metrics)
 
-            if exploring and env_steps >= config.initial_collect_steps:
+            if warming_up and env_steps >= config.initial_collect_steps:
                 agent.fit_scaling(*buffer.observations_and_returns())
                 run.start_evaluation(step, env_steps, agent.policy)
             if env_steps % 100 < steps_per_round:
