@@ -139,6 +139,29 @@ class Dynamics:
     """lateral friction coefficient of the feet, U(0.8, 1.5)"""
 
 
+class Simulator:
+    """A simulation of its own in this process, with pybullet's functions as methods.
+
+    As `pybullet_utils.bullet_client.BulletClient`, which prints a line to the console for every simulation it opens.
+    """
+
+    def __init__(self):
+        # Imported here so that other tasks train on machines without pybullet.
+        import pybullet
+        import pybullet_data
+
+        self.pybullet = pybullet
+        self.client = pybullet.connect(pybullet.DIRECT)
+        self.setAdditionalSearchPath(pybullet_data.getDataPath())
+
+    def __getattr__(self, name):
+        value = getattr(self.pybullet, name)
+        if callable(value):
+            value = partial(value, physicsClientId=self.client)
+        setattr(self, name, value)  # looked up once
+        return value
+
+
 class MinitaurBulletEnv(gym.Env):
     """Ghost Robotics' Minitaur on a plane, equal to the last bit to pybullet's `MinitaurBulletEnv-v0` of the old gym.
 
@@ -170,14 +193,8 @@ class MinitaurBulletEnv(gym.Env):
     MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13
 
     def __init__(self, render_mode=None):
-        # Imported here so that other tasks train on machines without pybullet.
-        import pybullet
-        import pybullet_data
-        from pybullet_utils.bullet_client import BulletClient
-
         self.render_mode = render_mode
-        self.simulator = BulletClient(pybullet.DIRECT)  # a simulation of its own, with pybullet's functions as methods
-        self.simulator.setAdditionalSearchPath(pybullet_data.getDataPath())
+        self.simulator = Simulator()
         max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT
         high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01
         self.observation_space = gym.spaces.Box(np.float32(-high), np.float32(high))
