@@ -700,6 +700,8 @@ class Run:
         path)` films one episode, or is None. A video or a curve that fails costs a line, not the run.
         """
         stopped = step < self.config.num_iterations
+        if self.evaluations.pending and not stopped:
+            self.print("waiting for the last evaluations …")
         while self.evaluations.pending and not stopped:
             self.report_evaluations(policy_file)
             stopped = self.stop_requested()
