@@ -21,7 +21,7 @@ FIGURES = {
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "sac_minitaur_long": (
-        "SAC on the Minitaur, continued",
+        "SAC on the Minitaur, longer runs",
         15.0,
         {
             "sac_minitaur_long": "ours",
