@@ -9,11 +9,11 @@
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every value of theirs is a default here but
 those marked "ours" in `Config`. The tutorial discounts by 1 and bootstraps from the network of the step before, so
-that nothing bounds its values: its losses reach 1e10, and those who trained on saw the return fall back to 12 to 32.
-Here the observations come on one scale; values are discounted and start from what an endless episode is worth, so that
-only falling and leaving the track have to be learned, and in a unit in which that is a short way; they are bounded by
-it; a target network follows slowly; the values of the two actions, nearly equal after so short a step, are pushed
-apart; and the learning rate decays.
+that nothing bounds its values: its losses reach 1e10, and for one who trained on to 130 000 updates the return fell
+back to 12 to 32 (https://github.com/tensorflow/agents/issues/316). Here the observations come on one scale; values are
+discounted and start from what an endless episode is worth, so that only falling and leaving the track have to be
+learned, and in a unit in which that is a short way; they are bounded by it; a target network follows slowly; the values
+of the two actions, nearly equal after so short a step, are pushed apart; and the learning rate decays.
 """
 
 import math

@@ -17,7 +17,7 @@ FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_minitaur": "ours", "sac_unprivileged": "ours, critics that see no more than the actor"},
+        {"sac_minitaur": "ours", "sac_unprivileged": "ours without privileged critics"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "sac_minitaur_long": (
@@ -25,8 +25,8 @@ FIGURES = {
         15.0,
         {
             "sac_minitaur_long": "ours",
-            "sac_unprivileged_long": "critics that see no more than the actor",
-            "sac_minitaur_last_reward_long": "that, last reward observed",
+            "sac_unprivileged_long": "without privileged critics",
+            "sac_minitaur_last_reward_long": "without them, last reward observed",
         },
         (),
     ),
@@ -117,7 +117,7 @@ def draw(name, title, threshold, ours, published):
         axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, {counted}")
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
-        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=run.replace("_", " "))
+        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=f"tutorial, {run.rpartition('_')[2]}")
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
     axes.ticklabel_format(style="plain")
