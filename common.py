@@ -1,7 +1,7 @@
 """What both training scripts need and what can be specified without knowing the algorithm.
 
 Devices and processes, the run directory with its metrics, plots, videos, exported policies and checkpoint files.
-Nothing here knows a network, a loss or a replay buffer.
+No network, loss or replay buffer is defined here.
 """
 
 import contextlib
@@ -28,6 +28,7 @@ import zipfile
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from datetime import datetime
 from pathlib import Path
 
 import gymnasium as gym
@@ -94,11 +95,13 @@ def run_main(main):
         main()
     except (InputError, RunError) as error:
         if int(os.environ.get("RANK", 0)) > 0:
-            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun then ends this one, and one line is said
+            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun then ends this one, and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
         # Ranks that wait for each other in a collective would keep an orderly exit from ending.
         sys.stdout.flush()
         os._exit(error.exit_status) if dist.is_initialized() else sys.exit(error.exit_status)
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 # Devices, randomness and memory
@@ -143,7 +146,7 @@ def empty_replay(capacity, columns, device):
     """An uninitialized float32 tensor (capacity, columns). Raises InputError when the device has not that much memory."""
     try:
         return torch.empty(capacity, columns, device=device)
-    except RuntimeError:
+    except (RuntimeError, TypeError):  # the latter for a number beyond 64 bits
         size = f"{capacity * columns * 4 / 1e9:.1f} GB"
         raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
 
@@ -281,7 +284,10 @@ class SeededEpisodes(gym.Wrapper):
 
 
 class Episodes:
-    """Where the running episode of each of K environments stands, and how the last 10 to end did."""
+    """Where the running episode of each of K environments stands, and how the last 10 to end did.
+
+    `number[i]` counts the episodes of environment i that have ended.
+    """
 
     def __init__(self, num_envs, seed, first_index=0, state=None):
         self.seed, self.first_index = seed, first_index
@@ -329,10 +335,6 @@ class Episodes:
                 self.number[i] += 1
                 self.actions[i], self.returns[i] = [], 0.0
 
-    def even(self):
-        """Whether the running episode of each environment is its first, third, fifth … (K,)."""
-        return np.array(self.number) % 2 == 0
-
     def state(self):
         """Everything needed to come back to this point, for a checkpoint."""
         actions = [torch.from_numpy(np.array(actions)) for actions in self.actions]
@@ -365,15 +367,17 @@ class Evaluations:
     def __init__(self, evaluate, env_id, seeds, ranks):
         self.evaluate, self.env_id, self.seeds, self.ranks = evaluate, env_id, seeds, ranks
         self.pending = deque()
+        # The cores that this process may use: on a cluster's node they are not all of them.
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         self.pool = ProcessPoolExecutor(
-            min(os.cpu_count(), math.ceil(len(seeds) / ranks.world_size)),
+            min(cores, math.ceil(len(seeds) / ranks.world_size)),
             multiprocessing.get_context(START_METHOD),
             initializer=_start_pool_worker,
         )
         # The first call forks the workers: now, before anything has used a GPU or started threads.
         self.pool.submit(int).result()
         for worker in self.pool._processes.values():
-            worker.terminate = worker.kill  # when one has died the pool ends the others, who ignore SIGTERM
+            worker.terminate = worker.kill  # when one has died the pool ends the others, which ignore SIGTERM
 
     def start(self, header, policy):
         """Starts evaluating a copy of `policy` (None: random actions), to be reported with `header`, a dict."""
@@ -482,7 +486,7 @@ def write_atomically(path, write):
 def _reason(error):
     while error.__context__ is not None and not isinstance(error, OSError):
         error = error.__context__
-    return getattr(error, "strerror", None) or str(error).splitlines()[0]
+    return getattr(error, "strerror", None) or first_line(error)
 
 
 class Run:
@@ -501,7 +505,7 @@ class Run:
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
         self.device = select_device(config.device, self.ranks.local_rank)
-        if config.resume:
+        if config.resume is not None:
             self.path = Path(config.resume)
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
             self.checkpoint = shared | own
@@ -509,7 +513,8 @@ class Run:
                 if name not in (*HARMLESS_FIELDS, "run_dir", "num_iterations") and saved != getattr(config, name, None):
                     raise InputError(f"{self.path}/checkpoint.pt is another run's: its {name} is {saved}")
         else:
-            default = Path("runs") / f"{script}-{time.strftime('%Y%m%d-%H%M%S')}-seed{config.seed}"
+            # To the microsecond, for runs that are started at once.
+            default = Path("runs") / f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
             self.path = Path(self.ranks.broadcast(config.run_dir or default))
             self.checkpoint = {}
             if self.writes:
@@ -518,7 +523,7 @@ class Run:
         self.best_return = self.checkpoint.get("best_return", -math.inf)
         self.best_weights = self.checkpoint.get("best_weights")
         self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
-        self.session = (time.monotonic(), self.checkpoint.get("step", 0))
+        self.last_logged = (time.monotonic(), self.checkpoint.get("step", 0))
         self.summary_writer = None
         # The workers are forked here, before anything has used a GPU.
         seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
@@ -535,13 +540,13 @@ class Run:
             self.stack.callback(self.evaluations.close)
             self.enter(self.stop)
             if self.writes:
-                if self.config.resume:
+                if self.config.resume is not None:
                     self._rewrite_tables()
                 self._save_config()
             self.progress = self.enter(
                 tqdm(
                     total=self.config.num_iterations,
-                    initial=self.session[1],
+                    initial=self.last_logged[1],
                     unit="step",
                     disable=not (self.writes and sys.stderr.isatty()),
                 )
@@ -559,6 +564,7 @@ class Run:
             # Its thread raises once more what it met on a full disk; the CSVs have said so already.
             with contextlib.suppress(OSError):
                 self.summary_writer.close()
+            threading.excepthook = self.excepthook
         if isinstance(error, (EOFError, ConnectionError, BrokenProcessPool)):
             raise RunError(f"a worker process died; --resume {self.path} continues from the last checkpoint") from error
         if isinstance(error, RuntimeError) and self.ranks.world_size > 1 and "gloo" in str(error):
@@ -604,8 +610,10 @@ class Run:
         try:
             tqdm.write(line)
             sys.stdout.flush()
-        except BrokenPipeError:
+        except OSError as error:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not isinstance(error, BrokenPipeError):
+                raise RunError(f"cannot print ({error.strerror}); the last good checkpoint is kept") from error
             self.stop.requested = True
 
     def log(self, table, row):
@@ -627,7 +635,7 @@ class Run:
         if self.summary_writer is None:
             self.summary_writer = SummaryWriter(self.path)
             # Its thread would print what it meets on a full disk, and raises it here at the next row anyway.
-            others = threading.excepthook
+            others = self.excepthook = threading.excepthook
             threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or others(thread)
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
@@ -638,9 +646,9 @@ class Run:
         return {"step": step, "env_steps": env_steps, "seconds": round(time.monotonic() - self.started, 3)}
 
     def log_training(self, step, env_steps, episodes, metrics):
-        """Logs one update's `metrics`, scalar tensors, and the recent episodes that were collected."""
-        start, first_step = self.session
-        speed = (step - first_step) / (time.monotonic() - start)
+        """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row."""
+        (then, last_step), self.last_logged = self.last_logged, (time.monotonic(), step)
+        speed = (step - last_step) / (self.last_logged[0] - then)
         values = {name: float(value) for name, value in metrics.items()}
         self.log("train", self.header(step, env_steps) | {"steps_per_second": speed} | episodes.recent() | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
@@ -699,7 +707,7 @@ class Run:
         After a stop nothing is waited for or filmed: the checkpoint has what is open. `film(policy, env_id, seed,
         path)` films one episode, or is None. A video or a curve that fails costs a line, not the run.
         """
-        stopped = step < self.config.num_iterations
+        stopped = self.stop_requested()
         if self.evaluations.pending and not stopped:
             self.print("waiting for the last evaluations …")
         while self.evaluations.pending and not stopped:
@@ -721,6 +729,7 @@ class Run:
                     time.sleep(0.05)
                 if video.done() and video.exception():
                     self.print(f"warning: no video ({first_line(video.exception())})")
+            stopped = self.stop.requested
         try:
             random_return = self.tables["random"][0]["average_return"] if "random" in self.tables else None
             title = f"{self.config.env_id}, seed {self.config.seed}"
@@ -728,7 +737,9 @@ class Run:
         except Exception as error:
             self.print(f"warning: no learning curve ({first_line(error)})")
         if stopped:
-            self.print(f"stopped at step {step}; to continue: python {self.script}.py --resume {self.path}")
+            ranks = self.ranks.world_size
+            python = "python" if ranks == 1 else f"torchrun --nproc-per-node {ranks}"
+            self.print(f"stopped at step {step}; to continue: {python} {self.script}.py --resume {self.path}")
         else:
             files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
             self.print(f"finished; {self.path} holds {files}")
@@ -846,7 +857,7 @@ class PolicyFile:
     def save(self, path, policy):
         """Writes `policy` with its weights of now, loadable by `torch.export.load(path).module()` with none of our code."""
         self.policy.load_state_dict(policy.state_dict())  # the program refers to these very tensors
-        archive = io.BytesIO()
+        archive = io.BytesIO()  # torch.export.save into a file on a full disk ends the process
         torch.export.save(self.program, archive)
         write_atomically(path, lambda file: file.write(archive.getvalue()))
 
@@ -946,8 +957,8 @@ def plot_learning_curve(path, tables, title, reward_threshold=None, random_retur
 def record_video(path, env, act, seed):
     """Films one episode in real time, at 50 frames a second or fewer.
 
-    `env` renders `rgb_array`; `act(observation)` returns an action. The episode is closed and the file is whole, or
-    there is none.
+    `env` renders `rgb_array`; `act(observation)` returns an action. The environment is closed afterwards, and the file
+    is whole or not there.
     """
     import imageio
 
@@ -956,17 +967,21 @@ def record_video(path, env, act, seed):
     temporary = path.with_name(f".tmp-{path.name}")
     frames_per_second = env.metadata["render_fps"]
     skip = math.ceil(frames_per_second / 50)
-    with imageio.get_writer(temporary, fps=frames_per_second / skip, macro_block_size=2) as video:
-        observation, _ = env.reset(seed=seed)
-        done, step = False, 0
-        while not done:
-            if step % skip == 0:
-                video.append_data(env.render())
-            observation, _, terminated, truncated, _ = env.step(act(observation))
-            done, step = terminated or truncated, step + 1
-        video.append_data(env.render())
-    env.close()
-    os.replace(temporary, path)
+    writer = imageio.get_writer(temporary, fps=frames_per_second / skip, macro_block_size=2)
+    try:
+        with contextlib.closing(writer) as video:  # its own context leaves it open after an error
+            observation, _ = env.reset(seed=seed)
+            done, step = False, 0
+            while not done:
+                if step % skip == 0:
+                    video.append_data(env.render())
+                observation, _, terminated, truncated, _ = env.step(act(observation))
+                done, step = terminated or truncated, step + 1
+            video.append_data(env.render())
+        os.replace(temporary, path)
+    finally:
+        env.close()
+        temporary.unlink(missing_ok=True)
 
 
 def require_finite(step, metrics):

@@ -12,8 +12,9 @@ those marked "ours" in `Config`. The tutorial discounts by 1 and bootstraps from
 that nothing bounds its values: its losses reach 1e10, and for one who trained on to 130 000 updates the return fell
 back to 12 to 32 (https://github.com/tensorflow/agents/issues/316). Here the observations come on one scale; values are
 discounted and start from what an endless episode is worth, so that only falling and leaving the track have to be
-learned, and in a unit in which that is a short way; they are bounded by it; a target network follows slowly; the values
-of the two actions, nearly equal after so short a step, are pushed apart; and the learning rate decays.
+learned, and in a unit in which that is a short way; they are bounded by it; a target network follows slowly, and values
+the action that the Q-network chooses (double DQN, which alone has no flag); the values of the two actions, nearly equal
+after so short a step, are pushed apart; and the learning rate decays.
 """
 
 import math
@@ -107,7 +108,7 @@ class Config:
 
 
 def make_env(env_id, **kwargs):
-    """The task as registered. Raises InputError when it is unknown or its spaces are not discrete actions in a Box."""
+    """The task as registered. Raises InputError when it is unknown or its spaces are not what DQN needs."""
     try:
         with warnings.catch_warnings():
             # The tutorial's task: that gymnasium has a v1, with 500 steps instead of 200, is no news here.
@@ -115,10 +116,11 @@ def make_env(env_id, **kwargs):
             env = gym.make(env_id, **kwargs)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"--env-id {env_id} cannot be made: {common.first_line(error)}") from None
-    if not isinstance(env.action_space, gym.spaces.Discrete) or env.action_space.start != 0:
-        raise InputError(f"--env-id {env_id} has the action space {env.action_space}: DQN needs a Discrete from 0")
-    if not isinstance(env.observation_space, gym.spaces.Box):
-        raise InputError(f"--env-id {env_id} has the observation space {env.observation_space}: a Box is needed")
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
+        raise InputError(f"--env-id {env_id} has the observation space {observations}: a Box of some dimension is needed")
+    if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
+        raise InputError(f"--env-id {env_id} has the action space {actions}: DQN needs a Discrete from 0")
     return env
 
 
@@ -225,7 +227,7 @@ class ReplayBuffer:
 
     def state(self):
         """A copy of the filled part, for a checkpoint."""
-        rows = self.rows[: self.size].cpu().clone()
+        rows = self.rows[: self.size].to("cpu", copy=True)
         return {"rows": rows, "position": self.position, "largest_reward": self.largest_reward}
 
     def load_state(self, state):
@@ -263,7 +265,7 @@ def td_loss(q, targets):
 class DQNAgent:
     """The Q-network with its target and optimizer.
 
-    The tutorial's network starts near Q = 0 and climbs to 1 / (1 − γ), a reward at a time, and for as long it looks no
+    The tutorial's network starts near Q = 0 and climbs to 1 / (1 − γ), a reward at a time, and meanwhile looks no
     further ahead than it has climbed: it balances the pole and does not see that the cart leaves the track. Here
     `value_offset`, the worth of an endless episode, is added to the network, which has to learn only what ends it.
     """
@@ -313,7 +315,7 @@ class DQNAgent:
         """
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
-        # Where all states are worth the same, errors of extrapolation would add up: the mean Q grew to twice the bound.
+        # Without it errors of extrapolation add up where all states are worth the same: the mean Q grew to twice as much.
         # Where every reward is a cost, the best that can happen is that the episode ends.
         bound = max(largest_reward, largest_reward / (1 - config.gamma)) if config.value_bound else math.inf
 
@@ -405,7 +407,8 @@ def check(config):
     if not 0 < config.value_scale < math.inf:
         raise InputError(f"--value-scale {config.value_scale} is no scale: use a positive number")
     if (config.value_offset or config.value_bound) and config.gamma >= 1:
-        raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1")
+        raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1,"
+                         " or --no-value-offset --no-value-bound")
 
 
 def train(config):
@@ -435,7 +438,7 @@ def train(config):
         step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
         if saved:
             agent.load_state(saved["agent"])
-            buffer.load_state(saved["buffer"])
+            buffer.load_state(saved.pop("buffer"))  # not kept beside it
             common.set_random_state(saved["random"])
             run.restart_evaluations(agent.policy, policy_file)
         else:
@@ -481,7 +484,7 @@ def train(config):
                     run.start_evaluation(step, env_steps, agent.policy)
             common.require_finite(step, metrics)
 
-            if env_steps % 100 < steps_per_round:
+            if env_steps % 100 < steps_per_round:  # not at every step: between processes each look is a message
                 run.report_evaluations(policy_file)
                 stopping = run.stop_requested()
             if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:
@@ -496,9 +499,9 @@ def train(config):
 
 def main():
     config = tyro.cli(Config, description=__doc__)
-    if config.resume:
+    if config.resume is not None:
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
-    if config.evaluate:
+    if config.evaluate is not None:
         check(config)
         common.evaluate_policy_file(config, make_env, evaluate, film)
     else:

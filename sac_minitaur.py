@@ -62,7 +62,7 @@ class Config:
     velocity and height). The actor does not, so that the policy needs no more than the task gives (arXiv:1710.06542)"""
     critic_batch_norm: bool = True
     """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
-    (arXiv:1902.05605): what is learned is then worth something a step later, not a fifth of the run"""
+    (arXiv:1902.05605): what is learned then counts at the next update, not a fifth of the run later"""
     target_update_tau: float = 0.005
     """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
@@ -77,10 +77,10 @@ class Config:
     """ours (theirs: 1): factor of the rewards, after the division"""
     averaged_actor_tau: float = 0.005
     """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update. It acts
-    where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment falls"""
+    where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment may fall"""
     mean_action_episodes: bool = True
     """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean
-    action, so that the replay holds where that leads"""
+    action, so that the replay holds the states that it leads to"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
@@ -142,7 +142,8 @@ class Dynamics:
 class Simulator:
     """A simulation of its own in this process, with pybullet's functions as methods.
 
-    As `pybullet_utils.bullet_client.BulletClient`, which prints a line to the console for every simulation it opens.
+    It ends with its last reference. As `pybullet_utils.bullet_client.BulletClient`, which prints a line to the console
+    for every simulation it opens.
     """
 
     def __init__(self):
@@ -160,6 +161,10 @@ class Simulator:
             value = partial(value, physicsClientId=self.client)
         setattr(self, name, value)  # looked up once
         return value
+
+    def __del__(self):
+        if "client" in self.__dict__:  # not where pybullet is missing
+            self.disconnect()
 
 
 class MinitaurBulletEnv(gym.Env):
@@ -257,7 +262,7 @@ class MinitaurBulletEnv(gym.Env):
 
     def step(self, action):
         """Raises ValueError when an action component is outside ±1.01, as the original does."""
-        action = np.asarray(action)
+        action = 1.0 * np.asarray(action)  # whole numbers would be computed in whole numbers
         if not (np.abs(action) <= 1.01).all():
             raise ValueError(f"action {action} is outside [-1, 1]")
         command = self._motor_angles(action)
@@ -330,8 +335,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        if self.simulator.isConnected():
-            self.simulator.disconnect()
+        self.simulator = None  # ended just once: pybullet gives its number to the next one
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
@@ -341,15 +345,18 @@ if "MinitaurBulletEnv-v0" not in gym.registry:
 
 
 def make_env(env_id, **kwargs):
-    """The task as registered. Raises InputError when it is unknown or its spaces are not bounded actions in a Box."""
+    """The task as registered. Raises InputError when it is unknown or its spaces are not what SAC needs."""
     try:
         env = gym.make(env_id, **kwargs)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"--env-id {env_id} cannot be made: {common.first_line(error)}") from None
-    if not isinstance(env.action_space, gym.spaces.Box) or not env.action_space.is_bounded():
-        raise InputError(f"--env-id {env_id} has the action space {env.action_space}: SAC needs a bounded Box")
-    if not isinstance(env.observation_space, gym.spaces.Box):
-        raise InputError(f"--env-id {env_id} has the observation space {env.observation_space}: a Box is needed")
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
+        raise InputError(f"--env-id {env_id} has the observation space {observations}: a Box of some dimension is needed")
+    if not (isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f" and actions.is_bounded()):
+        raise InputError(f"--env-id {env_id} has the action space {actions}: SAC needs a bounded Box of real numbers")
+    if not (actions.low < actions.high).all():
+        raise InputError(f"--env-id {env_id} has the action space {actions}: SAC needs room between its bounds")
     return env
 
 
@@ -426,7 +433,7 @@ def mlp(inputs, hidden_layers, outputs, normalization=None):
 class ObservationScaling(nn.Module):
     """Standardizes observations (…, S) by a fixed mean and standard deviation, clipped to ±10; the identity until `fit`.
 
-    Those that end earlier, without what only the critics see, are scaled as far as they go.
+    A shorter one, without what only the critics see, is scaled by the first S' of these.
     """
 
     def __init__(self, observation_size):
@@ -558,7 +565,7 @@ class ReplayBuffer:
     def state(self):
         """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
         incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
-        return {"rows": self.rows[: self.size].cpu().clone(), "position": self.position, "incomplete": incomplete}
+        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position, "incomplete": incomplete}
 
     def load_state(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
@@ -574,7 +581,7 @@ def td_targets(returns, discounts, next_q, next_log_probs, alpha):
     """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
     next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
-    reward and γ (1 − terminated), n of them and what they leave of γ (the entropy of the steps between is left out).
+    reward and γ (1 − terminated), n of them and the discount after them (the entropy of the steps between is left out).
     """
     return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
 
@@ -600,8 +607,8 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
 class SACAgent:
     """Actor, twin critics with their targets, and the temperature α, with their optimizers.
 
-    The actor sees the task's observation, O numbers. The critics see S = `state_size` of them (by default the same):
-    first the task's, then what only they see.
+    The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: first the task's, then
+    what only they see (by default nothing more).
     """
 
     def __init__(self, config, observation_space, action_space, device, ranks, state_size=None):
@@ -616,7 +623,7 @@ class SACAgent:
         self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
         normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, normalization).to(device)
-        # Batch normalization takes their place (CrossQ).
+        # With batch normalization there are none (CrossQ).
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = torch.tensor(float(config.initial_log_alpha), device=device, requires_grad=True)
         self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
@@ -627,7 +634,7 @@ class SACAgent:
         self.target_parameters = list(self.target_critics.parameters()) if self.target_critics else []
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
-        # One optimizer for the actor and α, who learn from the same sample of actions.
+        # One optimizer for the actor and α, which learn from the same sample of actions.
         groups = [
             {"params": self.actor_parameters, "lr": config.actor_learning_rate},
             {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
@@ -639,7 +646,7 @@ class SACAgent:
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     def fit_scaling(self, observations, returns):
-        """Fixes the scales of observations (N, S) and rewards, by their n-step returns (N,), of all ranks' first data."""
+        """Fixes the scales of observations and rewards by observations (N, S) and n-step returns (N,) of all ranks."""
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.reward_scaling:
@@ -817,7 +824,7 @@ def train(config):
         step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
         if saved:
             agent.load_state(saved["agent"])
-            buffer.load_state(saved["buffer"])
+            buffer.load_state(saved.pop("buffer"))  # not kept beside it
             common.set_random_state(saved["random"])
             run.restart_evaluations(agent.policy, policy_file)
         else:
@@ -841,7 +848,8 @@ def train(config):
             if warming_up:
                 actions = agent.random_actions(config.num_envs)
             else:
-                actions = agent.act(observations, sampled=episodes.even() | (not config.mean_action_episodes))
+                by_mean = config.mean_action_episodes & (np.array(episodes.number) % 2 == 1)  # every second episode
+                actions = agent.act(observations, sampled=~by_mean)
             envs.step_async(actions)  # the physics runs beside the updates, which sample what was stored before
             env_steps += steps_per_round
 
@@ -867,7 +875,7 @@ def train(config):
             if warming_up and env_steps >= config.initial_collect_steps:
                 agent.fit_scaling(*buffer.observations_and_returns())
                 run.start_evaluation(step, env_steps, agent.policy)
-            if env_steps % 100 < steps_per_round:
+            if env_steps % 100 < steps_per_round:  # not at every step: between processes each look is a message
                 run.report_evaluations(policy_file)
                 stopping = run.stop_requested()
             if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:
@@ -882,9 +890,9 @@ def train(config):
 
 def main():
     config = tyro.cli(Config, description=__doc__)
-    if config.resume:
+    if config.resume is not None:
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
-    if config.evaluate:
+    if config.evaluate is not None:
         check(config)
         common.evaluate_policy_file(config, make_env, evaluate, film)
     else:

@@ -126,6 +126,7 @@ def stopped(request, tmp_path_factory):
     wait_until((path / "run" / "train.csv").exists, seconds=600)
     ranks[1].kill(signal.SIGTERM)
     end(ranks)
+    assert f"torchrun --nproc-per-node 2 {request.param}.py --resume " in ranks[0].stdout
     return path / "run"
 
 

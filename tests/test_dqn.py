@@ -1,5 +1,6 @@
 """DQN: its formulas by hand, its parts by what they promise, and that it learns."""
 
+import copy
 import csv
 import dataclasses
 import math
@@ -319,7 +320,7 @@ def test_state_continues_exactly():
     for batch in batches[:3]:
         agent.update(batch, 1.0)
     other = make_agent()
-    other.load_state(common.pickle.loads(common.pickle.dumps(agent.state())))
+    other.load_state(copy.deepcopy(agent.state()))
     for batch in batches[3:]:
         agent.update(batch, 1.0), other.update(batch, 1.0)
     for mine, its in zip(tensors(agent.state()), tensors(other.state()), strict=True):
@@ -467,6 +468,7 @@ def test_imports_without_pybullet():
         ("--env-id Pendulum-v1", "Discrete"),
         ("--env-id FromOne-v0", "Discrete"),
         ("--env-id FrozenLake-v1", "Box"),
+        ("--env-id NoDimension-v0", "Box"),
         ("--device tpu", "tpu"),
         ("--batch-size 101", "batch"),
         ("--replay-buffer-capacity 63", "batch"),
@@ -495,12 +497,13 @@ def test_bad_input_is_one_line(arguments, said, monkeypatch, capfd, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("something").touch()
     gym.register("FromOne-v0", FromOne)
+    gym.register("NoDimension-v0", NoDimension)
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", *arguments.split()])
     try:
         with pytest.raises(SystemExit) as stopped:
             common.run_main(dqn_cartpole.main)
     finally:
-        del gym.registry["FromOne-v0"]
+        del gym.registry["FromOne-v0"], gym.registry["NoDimension-v0"]
     lines = capfd.readouterr().err.splitlines()
     assert stopped.value.code == 2
     assert len(lines) == 1 and lines[0].startswith("error: ") and said in lines[0]
@@ -509,6 +512,11 @@ def test_bad_input_is_one_line(arguments, said, monkeypatch, capfd, tmp_path):
 class FromOne(gym.Env):
     observation_space = gym.spaces.Box(-1, 1, (4,))
     action_space = gym.spaces.Discrete(2, start=1)
+
+
+class NoDimension(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, ())
+    action_space = gym.spaces.Discrete(2)
 
 
 def test_bad_input_from_the_shell():

@@ -170,6 +170,16 @@ def test_equals_the_original_walking_with_float64_actions(pair):
     assert fell_at is None
 
 
+def test_equals_the_original_with_whole_numbers(pair):
+    pair.env.reset(seed=0)
+    pair.original.reset()
+    for action in [[1, -1, 1, -1, 0, 0, 0, 0]] * 5:
+        observation, reward, *_ = pair.env.step(action)
+        expected, expected_reward, *_ = pair.original.step(action)
+        assert_same_observation(observation, expected)
+        assert reward == expected_reward
+
+
 def test_equals_the_original_when_motors_overheat(pair):
     _, fell_at, overheated_at = pair.play(0, crouch, np.float64, num_steps=220)
     assert overheated_at is not None and 100 < overheated_at < 200  # the steps after the switch-off are compared too
@@ -268,6 +278,24 @@ def test_a_used_simulator_gives_the_bits_of_a_fresh_one(env):
     used = rollout(env, seed=5)
     with gym.make(ENV_ID) as fresh:
         assert rollout(fresh, seed=5) == used
+
+
+def test_simulations_end_once_and_alone():
+    """pybullet gives the number of one that has ended to the next."""
+    closed = gym.make(ENV_ID).unwrapped
+    client = closed.simulator.client
+    closed.close()
+    with gym.make(ENV_ID) as other:
+        assert other.unwrapped.simulator.client == client
+        other.reset(seed=0)
+        closed.close()
+        del closed
+        other.step(trot(0))
+        forgotten = gym.make(ENV_ID)
+        client = forgotten.unwrapped.simulator.client
+        assert pybullet.isConnected(client)
+        del forgotten
+        assert not pybullet.isConnected(client)
 
 
 def test_dynamics_can_be_given(env):

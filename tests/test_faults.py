@@ -12,6 +12,7 @@ import subprocess
 import zipfile
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import gymnasium as gym
 import imageio
@@ -310,6 +311,15 @@ def test_full_disk_from_the_start(script, small_disk, tmp_path):  # noqa: F811
     assert run.status and len(run.stderr.strip().split("\n")) == 1, run.stderr
 
 
+def test_console_on_a_full_disk(script, tmp_path):  # noqa: F811
+    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", print_to_a_full_disk)
+    assert_one_line(run, 1, "No space left")
+
+
+def print_to_a_full_disk(module):
+    os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
+
+
 def test_rows_are_whole_or_not_there(tmp_path):
     """A write that the disk has room for in part only."""
     path = tmp_path / "train.csv"
@@ -393,6 +403,16 @@ def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_a_video_that_fails_leaves_nothing(tmp_path):
+    env = Blinking()
+    env.close = mock.Mock()
+    with mock.patch.object(env, "render", side_effect=[np.zeros((16, 16, 3), np.uint8), ValueError]):
+        with pytest.raises(ValueError):
+            common.record_video(tmp_path / "film.mp4", env, lambda observation: 0, seed=0)
+    env.close.assert_called_once_with()
+    assert not any(tmp_path.iterdir())
+
+
 def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = finish(script, arguments, tmp_path / "output", die_filming)
@@ -429,6 +449,37 @@ class NanReward(gym.RewardWrapper):
 def with_nan_rewards(module):
     make_training_env = module.make_training_env
     module.make_training_env = lambda *args: NanReward(make_training_env(*args))
+
+
+def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):  # noqa: F811
+    env = ["--env-id", "Pendulum-v1"] if script == "sac_minitaur" else []
+    run = Process(script, ["--evaluate", reference / "policy.pt2", *env], tmp_path / "output", interrupt_acting)
+    assert run.wait() == 130 and not run.stderr
+
+
+def interrupt_acting(module):
+    before_call(module, "act", 3, lambda: os.kill(os.getpid(), signal.SIGINT))
+
+
+def test_runs_that_start_at_once_have_directories_of_their_own(script, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    config = importlib.import_module(script).Config(device="cpu", num_eval_episodes=1)
+    runs = [common.Run(config, script, len) for _ in range(2)]
+    for run in runs:
+        run.evaluations.close()
+    assert runs[0].path != runs[1].path and runs[0].path.parent == runs[1].path.parent == Path("runs")
+
+
+def test_evaluations_take_the_cores_they_may_use():
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        evaluations = common.Evaluations(len, "", range(8), common.Ranks())
+    finally:
+        os.sched_setaffinity(0, allowed)
+    workers = len(evaluations.pool._processes)
+    evaluations.close()
+    assert workers == 1
 
 
 def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811

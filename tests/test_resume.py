@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 from functools import partial
 
@@ -135,6 +136,9 @@ def test_reference_is_worth_comparing_with(script, reference):
     assert any(len(actions) > 0 for actions in own["episodes"]["actions"])
     assert [row[0] for row in rows(reference / "eval.csv")] == ["step", "0", "100", "200", "300"]
     assert [row[0] for row in rows(reference / "train.csv")] == ["step", *map(str, range(20, 301, 20))]
+    # The speed is that of the updates since the last row: the start took longer than all of them.
+    last = list(csv.DictReader((reference / "train.csv").open()))[-1]
+    assert float(last["steps_per_second"]) > 1.3 * 300 / float(last["seconds"])
 
 
 def test_killed_at_every_moment_and_resumed(script, reference, tmp_path):
@@ -214,6 +218,23 @@ def signal_itself(module):
     number = signal.SIGTERM if module.__name__ == "sac_minitaur" else signal.SIGINT
     # To the whole process group, as a terminal and torchrun do.
     before_call(getattr(module, AGENTS[module.__name__]), "update", 110, lambda: os.killpg(0, number))
+
+
+def test_a_stop_at_the_last_update_is_a_stop(script, tmp_path):
+    """Also with no evaluation under way. The last one comes when the run is continued."""
+    arguments = flags(script, tmp_path / "run", "--initial-collect-steps", 100, "--eval-interval", 200)
+    run = finish(script, arguments, tmp_path / "output", signal_itself_at_the_end)
+    assert "stopped at step 300" in run.stdout.splitlines()[-1]
+    finish(script, ["--resume", tmp_path / "run"], tmp_path / "last")
+    assert [row[0] for row in rows(tmp_path / "run" / "eval.csv")] == ["step", "0", "200", "300"]
+
+
+def signal_itself_at_the_end(module):
+    def wait_and_signal():
+        time.sleep(2)  # the evaluations have ended by then
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before_call(getattr(module, AGENTS[module.__name__]), "update", 300, wait_and_signal)
 
 
 def test_stops_when_nobody_reads_on(script, tmp_path):

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -895,6 +896,35 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     assert named in output.err and output.out == ""
     assert (tmp_path / "full" / "file").read_text() == "somebody's work"
     assert (tmp_path / "run").exists() == ("GB" in named)  # only memory is found out later
+
+
+@pytest.mark.parametrize("flag", ["--resume", "--evaluate"])
+def test_an_empty_path_does_not_train(flag, monkeypatch, capfd, tmp_path):
+    """As of a shell's variable that is not set."""
+    monkeypatch.chdir(tmp_path)
+    status = main(monkeypatch, flag, "")
+    assert_one_line(status, capfd.readouterr().err)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "kind, space",
+    [
+        ("action", gym.spaces.Box(0, 200, (2,), np.uint8)),
+        ("action", gym.spaces.Box(-1, np.inf, (2,))),
+        ("action", gym.spaces.Box(np.float32([0, -1]), np.float32([0, 1]))),
+        ("action", gym.spaces.Box(-1, 1, ())),
+        ("observation", gym.spaces.Box(-1, 1, ())),
+        ("observation", gym.spaces.Discrete(3)),
+    ],
+)
+def test_spaces_that_sac_cannot_use(kind, space, monkeypatch):
+    env = SimpleNamespace(observation_space=gym.spaces.Box(-1, 1, (2,)), action_space=gym.spaces.Box(-1, 1, (2,)))
+    monkeypatch.setattr(gym, "make", lambda env_id: env)
+    assert sac_minitaur.make_env("Task-v0") is env
+    setattr(env, f"{kind}_space", space)
+    with pytest.raises(common.InputError, match=f"Task-v0 has the {kind} space"):
+        sac_minitaur.make_env("Task-v0")
 
 
 @pytest.mark.parametrize("arguments", ["--env-id NoSuchTask-v0", "--env-id Pendulum-v1 --device cuda:77"])
