@@ -407,8 +407,10 @@ def check(config):
     if not 0 < config.value_scale < math.inf:
         raise InputError(f"--value-scale {config.value_scale} is no scale: use a positive number")
     if (config.value_offset or config.value_bound) and config.gamma >= 1:
-        raise InputError(f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1,"
-                         " or --no-value-offset --no-value-bound")
+        raise InputError(
+            f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1, "
+            "or --no-value-offset --no-value-bound"
+        )
 
 
 def train(config):

@@ -117,7 +117,8 @@ def draw(name, title, threshold, ours, published):
         axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, {counted}")
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
-        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=f"tutorial, {run.rpartition('_')[2]}")
+        label = f"tutorial, {run.rpartition('_')[2]}"
+        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=label)
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
     axes.set(title=title, xlabel="gradient updates", ylabel="average return")
     axes.ticklabel_format(style="plain")
