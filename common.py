@@ -464,22 +464,30 @@ class StopRequest:
 # The run directory
 
 
+@contextlib.contextmanager
+def replacing(path):
+    """Gives the name of a temporary file, renamed to `path` at the end; an error removes it and leaves `path` alone."""
+    path = Path(path)
+    temporary = path.with_name(f".tmp-{path.name}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)  # what an error has left
+
+
 def write_atomically(path, write):
     """Lets `write(file)` fill a temporary file, then renames it to `path`: a kill leaves the old file or the new one.
 
     Raises RunError, leaving the old file whole, when the disk is full or not writable.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with open(temporary, "wb") as file:
+        with replacing(path) as temporary, open(temporary, "wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # torch.save reports a failed write as a RuntimeError
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise RunError(f"cannot write {path} ({_reason(error)}); the last good checkpoint is kept") from error
 
 
@@ -546,7 +554,7 @@ class Run:
             self.progress = self.enter(
                 tqdm(
                     total=self.config.num_iterations,
-                    initial=self.last_logged[1],
+                    initial=self.checkpoint.get("step", 0),
                     unit="step",
                     disable=not (self.writes and sys.stderr.isatty()),
                 )
@@ -560,11 +568,6 @@ class Run:
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
-        if self.summary_writer is not None:
-            # Its thread raises once more what it met on a full disk; the CSVs have said so already.
-            with contextlib.suppress(OSError):
-                self.summary_writer.close()
-            threading.excepthook = self.excepthook
         if isinstance(error, (EOFError, ConnectionError, BrokenProcessPool)):
             raise RunError(f"a worker process died; --resume {self.path} continues from the last checkpoint") from error
         if isinstance(error, RuntimeError) and self.ranks.world_size > 1 and "gloo" in str(error):
@@ -630,13 +633,8 @@ class Run:
             raise RunError(f"cannot write to {self.path} ({error.strerror}); the last good checkpoint is kept") from error
 
     def _write_summary(self, table, row):
-        from torch.utils.tensorboard import SummaryWriter
-
         if self.summary_writer is None:
-            self.summary_writer = SummaryWriter(self.path)
-            # Its thread would print what it meets on a full disk, and raises it here at the next row anyway.
-            others = self.excepthook = threading.excepthook
-            threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or others(thread)
+            self.summary_writer = self.enter(_tensorboard(self.path))
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
@@ -647,8 +645,9 @@ class Run:
 
     def log_training(self, step, env_steps, episodes, metrics):
         """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row."""
-        (then, last_step), self.last_logged = self.last_logged, (time.monotonic(), step)
-        speed = (step - last_step) / (self.last_logged[0] - then)
+        now, (then, last_step) = time.monotonic(), self.last_logged
+        self.last_logged = now, step
+        speed = (step - last_step) / (now - then)
         values = {name: float(value) for name, value in metrics.items()}
         self.log("train", self.header(step, env_steps) | {"steps_per_second": speed} | episodes.recent() | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
@@ -755,6 +754,22 @@ class Run:
             "evaluations": self.evaluations.state(),
         }
         save_checkpoint(self.path / "checkpoint.pt", self.script, shared, own, self.ranks)
+
+
+@contextlib.contextmanager
+def _tensorboard(path):
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(path)
+    # Its thread would print what it meets on a full disk, and raises it at the next row anyway.
+    others = threading.excepthook
+    threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or others(thread)
+    try:
+        yield writer
+    finally:
+        with contextlib.suppress(OSError):  # the same once more; the CSVs have said so already
+            writer.close()
+        threading.excepthook = others
 
 
 def append_whole(path, data):
@@ -963,12 +978,10 @@ def record_video(path, env, act, seed):
     import imageio
 
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
-    path = Path(path)
-    temporary = path.with_name(f".tmp-{path.name}")
     frames_per_second = env.metadata["render_fps"]
     skip = math.ceil(frames_per_second / 50)
-    writer = imageio.get_writer(temporary, fps=frames_per_second / skip, macro_block_size=2)
-    try:
+    with contextlib.closing(env), replacing(path) as temporary:
+        writer = imageio.get_writer(temporary, fps=frames_per_second / skip, macro_block_size=2)
         with contextlib.closing(writer) as video:  # its own context leaves it open after an error
             observation, _ = env.reset(seed=seed)
             done, step = False, 0
@@ -978,10 +991,6 @@ def record_video(path, env, act, seed):
                 observation, _, terminated, truncated, _ = env.step(act(observation))
                 done, step = terminated or truncated, step + 1
             video.append_data(env.render())
-        os.replace(temporary, path)
-    finally:
-        env.close()
-        temporary.unlink(missing_ok=True)
 
 
 def require_finite(step, metrics):

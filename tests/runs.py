@@ -21,10 +21,8 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 SCRIPTS = ("sac_minitaur", "dqn_cartpole")
 AGENTS = {"sac_minitaur": "SACAgent", "dqn_cartpole": "DQNAgent"}
-TINY = {
-    "sac_minitaur": "--env-id Pendulum-v1 --actor-layers 32 32 --critic-layers 32 32",
-    "dqn_cartpole": "--layers 32",
-}
+TASK = {"sac_minitaur": ["--env-id", "Pendulum-v1"], "dqn_cartpole": []}
+TINY = {"sac_minitaur": "--actor-layers 32 32 --critic-layers 32 32", "dqn_cartpole": "--layers 32"}
 COMMON = (
     "--device cpu --no-video --num-iterations 300 --initial-collect-steps 96 --batch-size 24 "
     "--replay-buffer-capacity 250 --log-interval 20 --eval-interval 100 --num-eval-episodes 2 --checkpoint-interval 50"
@@ -33,7 +31,7 @@ COMMON = (
 
 def flags(script, run_dir, *more):
     """The command line of a tiny run. Its replay wraps around, and its checkpoints fall into episodes."""
-    return [*TINY[script].split(), *COMMON.split(), "--run-dir", str(run_dir), *map(str, more)]
+    return [*TASK[script], *TINY[script].split(), *COMMON.split(), "--run-dir", str(run_dir), *map(str, more)]
 
 
 class Process:

@@ -14,7 +14,7 @@ import torch
 
 import common
 from runs import AGENTS, ROOT, SCRIPTS, assert_same, checkpoint, flags, rows, session, start_ranks, wait_until
-from test_resume import assert_same_run, before_call, die
+from test_resume import assert_same_run, before_update, die
 
 
 def end(ranks, statuses=None):
@@ -198,7 +198,7 @@ def test_killed_and_resumed_exactly_with_as_many_processes(trained, tmp_path):
 
 def kill_rank_1(module):
     if os.environ["RANK"] == "1":
-        before_call(getattr(module, AGENTS[module.__name__]), "update", 130, die)
+        before_update(module, 130, die)
 
 
 def test_two_processes_solve_cartpole(tmp_path):

@@ -21,8 +21,9 @@ import pytest
 import torch
 
 import common
-from runs import AGENTS, SCRIPTS, Process, checkpoint, flags, rows, session, wait_until
-from test_resume import assert_same_run, before_call, finish, reference, script  # noqa: F401 (fixtures)
+from runs import SCRIPTS, TASK, Process, checkpoint, flags, rows, session, wait_until
+from test_resume import assert_same_run, before_call, before_update, die, finish, interrupt
+from test_resume import reference, script  # noqa: F401 (fixtures)
 
 
 def assert_one_line(run, status, *words):
@@ -139,8 +140,7 @@ def test_damaged_config(script, copy, tmp_path):  # noqa: F811
 def test_one_script_does_not_continue_the_other(script, reference, tmp_path):  # noqa: F811
     other = SCRIPTS[1 - SCRIPTS.index(script)]
     assert_one_line(Process(other, ["--resume", reference], tmp_path / "resume"), 2, "config.json")
-    env = ["--env-id", "Pendulum-v1"] if other == "sac_minitaur" else []
-    run = Process(other, ["--evaluate", reference / "policy.pt2", "--no-video", *env], tmp_path / "evaluate")
+    run = Process(other, ["--evaluate", reference / "policy.pt2", "--no-video", *TASK[other]], tmp_path / "evaluate")
     assert_one_line(run, 2, "policy.pt2", "--env-id")
 
 
@@ -160,8 +160,7 @@ def test_damaged_or_foreign_policy(script, copy, tmp_path):  # noqa: F811
 
 
 def test_whole_policy_is_evaluated(script, reference, tmp_path):  # noqa: F811
-    env = ["--env-id", "Pendulum-v1"] if script == "sac_minitaur" else []
-    arguments = ["--evaluate", reference / "policy.pt2", "--no-video", "--num-eval-episodes", 1, *env]
+    arguments = ["--evaluate", reference / "policy.pt2", "--no-video", "--num-eval-episodes", 1, *TASK[script]]
     assert "AverageReturn = " in finish(script, arguments, tmp_path / "output").stdout
 
 
@@ -301,7 +300,7 @@ def test_full_disk(script, small_disk, reference, tmp_path):  # noqa: F811
 
 
 def fill_disk(module, path):
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 110, lambda: fill(path))
+    before_update(module, 110, lambda: fill(path))
 
 
 def test_full_disk_from_the_start(script, small_disk, tmp_path):  # noqa: F811
@@ -364,7 +363,7 @@ def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
 
 
 def die_evaluating(module):
-    before_call(module, "act", 3, lambda: os.kill(os.getpid(), signal.SIGKILL))
+    before_call(module, "act", 3, die)
 
 
 def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
@@ -421,7 +420,7 @@ def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
 
 
 def die_filming(module):
-    before_call(common, "record_video", 1, lambda: os.kill(os.getpid(), signal.SIGKILL))
+    before_call(common, "record_video", 1, die)
 
 
 def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
@@ -433,32 +432,14 @@ def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
     assert run.wait() == -signal.SIGKILL
 
 
-# Losses
-
-
-class NanReward(gym.RewardWrapper):
-    """Gives rewards that are not numbers from its 30th step on."""
-
-    left = 30
-
-    def reward(self, reward):
-        self.left -= 1
-        return reward if self.left > 0 else np.nan
-
-
-def with_nan_rewards(module):
-    make_training_env = module.make_training_env
-    module.make_training_env = lambda *args: NanReward(make_training_env(*args))
-
-
 def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):  # noqa: F811
-    env = ["--env-id", "Pendulum-v1"] if script == "sac_minitaur" else []
-    run = Process(script, ["--evaluate", reference / "policy.pt2", *env], tmp_path / "output", interrupt_acting)
+    arguments = ["--evaluate", reference / "policy.pt2", *TASK[script]]
+    run = Process(script, arguments, tmp_path / "output", interrupt_acting)
     assert run.wait() == 130 and not run.stderr
 
 
 def interrupt_acting(module):
-    before_call(module, "act", 3, lambda: os.kill(os.getpid(), signal.SIGINT))
+    before_call(module, "act", 3, interrupt)
 
 
 def test_runs_that_start_at_once_have_directories_of_their_own(script, tmp_path, monkeypatch):  # noqa: F811
@@ -480,6 +461,24 @@ def test_evaluations_take_the_cores_they_may_use():
     workers = len(evaluations.pool._processes)
     evaluations.close()
     assert workers == 1
+
+
+# Losses
+
+
+class NanReward(gym.RewardWrapper):
+    """Gives rewards that are not numbers from its 30th step on."""
+
+    left = 30
+
+    def reward(self, reward):
+        self.left -= 1
+        return reward if self.left > 0 else np.nan
+
+
+def with_nan_rewards(module):
+    make_training_env = module.make_training_env
+    module.make_training_env = lambda *args: NanReward(make_training_env(*args))
 
 
 def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811

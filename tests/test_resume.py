@@ -32,6 +32,10 @@ def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
 def before_call(owner, name, count, action):
     """Replaces a function by one that calls `action()` before its call number `count`."""
     function, calls = getattr(owner, name), iter(range(1, 10**9))
@@ -44,6 +48,10 @@ def before_call(owner, name, count, action):
     setattr(owner, name, counted)
 
 
+def before_update(module, count, action):
+    before_call(getattr(module, AGENTS[module.__name__]), "update", count, action)
+
+
 # Hooks: the moments at which a run is killed.
 
 
@@ -52,7 +60,7 @@ def collecting(module):
 
 
 def updating(module):
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 75, die)
+    before_update(module, 75, die)
 
 
 def evaluating(module):
@@ -217,7 +225,7 @@ def test_stop_and_continue(script, reference, tmp_path):
 def signal_itself(module):
     number = signal.SIGTERM if module.__name__ == "sac_minitaur" else signal.SIGINT
     # To the whole process group, as a terminal and torchrun do.
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 110, lambda: os.killpg(0, number))
+    before_update(module, 110, lambda: os.killpg(0, number))
 
 
 def test_a_stop_at_the_last_update_is_a_stop(script, tmp_path):
@@ -232,9 +240,9 @@ def test_a_stop_at_the_last_update_is_a_stop(script, tmp_path):
 def signal_itself_at_the_end(module):
     def wait_and_signal():
         time.sleep(2)  # the evaluations have ended by then
-        os.kill(os.getpid(), signal.SIGINT)
+        interrupt()
 
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 300, wait_and_signal)
+    before_update(module, 300, wait_and_signal)
 
 
 def test_stops_when_nobody_reads_on(script, tmp_path):
@@ -249,7 +257,7 @@ def lose_the_reader_at_update_50(module):
         os.dup2(writer, 1)
         os.close(reader)
 
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 50, lose_it)
+    before_update(module, 50, lose_it)
 
 
 def test_second_interrupt_stops_at_once(script, tmp_path):
@@ -259,8 +267,8 @@ def test_second_interrupt_stops_at_once(script, tmp_path):
 
 
 def interrupt_twice(module):
-    before_call(getattr(module, AGENTS[module.__name__]), "update", 20, lambda: os.kill(os.getpid(), signal.SIGINT))
-    before_call(common, "save_checkpoint", 2, lambda: os.kill(os.getpid(), signal.SIGINT))
+    before_update(module, 20, interrupt)
+    before_call(common, "save_checkpoint", 2, interrupt)
 
 
 def test_every_other_change_is_refused(script, reference):
@@ -347,6 +355,6 @@ def kill_after(module, updates, events):
 
     start = partial(sys.setprofile, count)
     if updates > 0:
-        before_call(getattr(module, AGENTS[module.__name__]), "update", updates, start)
+        before_update(module, updates, start)
     else:
         start()
