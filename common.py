@@ -13,12 +13,10 @@ import errno
 import functools
 import io
 import json
-import logging
 import math
 import multiprocessing
 import os
 import pickle
-import re
 import signal
 import sys
 import threading
@@ -877,63 +875,22 @@ class PolicyFile:
         write_atomically(path, lambda file: file.write(archive.getvalue()))
 
 
-# What each string of an exported graph may be, by its key: names, operators that only compute, the symbol of the batch
-# size. PyTorch compiles names and guards as Python code, evaluates symbols and looks operators up anywhere.
-_OPERATOR = r"torch\.ops\.aten\.[a-z]\w*\.[A-Za-z]\w*"
-_PLAIN = {
-    "target": _OPERATOR,
-    "as_operator": _OPERATOR,
-    "name": r"\w+",
-    "as_name": r"\w+",
-    "expr_str": r"Symbol\('\w+'(, \w+=True)*\)",
-    "as_string": "(?!)",  # no policy needs one, and some operators take a file's name
-    # one argument in, one tensor out
-    "in_spec": re.escape(torch.utils._pytree.treespec_dumps(torch.utils._pytree.tree_structure(((0,), {})))),
-    "out_spec": re.escape(torch.utils._pytree.treespec_dumps(torch.utils._pytree.tree_structure(0))),
-}
+def load_weights(path):
+    """The weights in a file of `PolicyFile`, name → float32 tensor. Nothing in the file is executed.
 
-
-def _plain_graph(tree, key=None):
-    """An exported graph without its nodes' notes. Raises ValueError for a string that loading it could execute."""
-    if isinstance(tree, dict):
-        return {name: {} if name == "metadata" else _plain_graph(value, name) for name, value in tree.items()}
-    if isinstance(tree, list):
-        return [_plain_graph(value, key) for value in tree]
-    if isinstance(tree, str) and not re.fullmatch(_PLAIN.get(key, r"[\w.+]*"), tree):
-        raise ValueError(f"its graph holds {tree[:60]!r}")
-    return tree
-
-
-def _plain_record(name, data):
-    """One record of an exported policy's archive. Raises ValueError for more than tensors and a graph."""
-    if name == "models/model.json":
-        return json.dumps(_plain_graph(json.loads(data)))
-    if name in ("data/weights/model_weights_config.json", "data/constants/model_constants_config.json"):
-        config = json.loads(data)
-        if any(entry["use_pickle"] for entry in config["config"].values()):
-            raise ValueError("it holds pickled objects")
-        return json.dumps(config)
-    if name == "data/sample_inputs/model.pt":
-        torch.load(io.BytesIO(data), weights_only=True)
-    elif not re.fullmatch(r"data/weights/weight_\d+|archive_format|archive_version|byteorder|\.data/\w+", name):
-        raise ValueError(f"it holds {name[:60]!r}")
-    return data
-
-
-def load_policy(path):
-    """Loads an exported policy as a callable module. Raises InputError for a missing, damaged, foreign or hostile file.
-
-    `torch.export.load` unpickles and evaluates what it finds, so it is given a copy that holds nothing but what
-    `PolicyFile` writes: copied, because two readers of one archive can be made to see different records.
+    `torch.export.load`, which would return the whole program, unpickles and evaluates what it finds. Raises InputError
+    when the file is missing, damaged or foreign.
     """
     try:
-        checked = io.BytesIO()
-        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(checked, "w") as plain:
-            for name in dict.fromkeys(archive.namelist()):
-                plain.writestr(name, _plain_record(name.partition("/")[2], archive.read(name)))
-        checked.seek(0)
-        logging.getLogger("torch.export").setLevel(logging.ERROR)  # it would log what is raised here in one line
-        return torch.export.load(checked).module()
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} is damaged")
+            folder = f"{archive.namelist()[0].partition('/')[0]}/data/weights"
+            weights = {}
+            for name, entry in json.loads(archive.read(f"{folder}/model_weights_config.json"))["config"].items():
+                values = torch.frombuffer(bytearray(archive.read(f"{folder}/{entry['path_name']}")), dtype=torch.float32)
+                weights[name] = values.view([size["as_int"] for size in entry["tensor_meta"]["sizes"]])
+            return weights
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: --evaluate takes a policy.pt2 file") from None
     except Exception as error:  # whatever a damaged or hostile file provokes
@@ -997,23 +954,24 @@ def require_finite(step, metrics):
     """Raises RunError naming the step and the first of `metrics`, a dict of scalar tensors, that is not finite."""
     if not metrics:
         return
-    finite = torch.stack(list(metrics.values())).isfinite()
-    if not finite.all():
-        name = list(metrics)[finite.tolist().index(False)]
-        raise RunError(f"{name} is {float(metrics[name])} at step {step}; the last good checkpoint is kept")
+    values = torch.stack(list(metrics.values())).tolist()  # one wait for a GPU instead of one for each
+    for name, value in zip(metrics, values):
+        if not math.isfinite(value):
+            raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
 
 
-def evaluate_policy_file(config, make_env, evaluate, film):
-    """What `--evaluate PATH` does: plays the exported policy's episodes, prints their returns and films one."""
-    policy = load_policy(config.evaluate)
+def evaluate_policy_file(config, make_env, make_policy, evaluate, film):
+    """What `--evaluate PATH` does: plays the exported policy's episodes, prints their returns and films one.
+
+    `make_policy(weights, observation_space, action_space)` returns the script's own policy, which then takes the weights.
+    """
+    weights = load_weights(config.evaluate)
     with make_env(config.env_id) as env:
-        observation_shape, action_shape = env.observation_space.shape, env.action_space.shape
-    try:
-        fits = policy(torch.zeros(1, *observation_shape)).shape[1:] == action_shape
-    except Exception:  # the exported program checks the shapes that it was traced with
-        fits = False
-    if not fits:
-        raise InputError(f"{config.evaluate} is not a policy for {config.env_id}: name its task with --env-id")
+        try:
+            policy = make_policy(weights, env.observation_space, env.action_space)
+            policy.load_state_dict(weights)
+        except (ValueError, RuntimeError):  # no layers, or others
+            raise InputError(f"{config.evaluate} is not a policy for {config.env_id}: name its task with --env-id") from None
     seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
     returns, lengths = zip(*(evaluate(policy, config.env_id, seed) for seed in tqdm(seeds, disable=None)))
     print(

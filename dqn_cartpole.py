@@ -189,6 +189,13 @@ class Policy(nn.Module):
         return self.q_network(self.scaling(observation.flatten(1))).argmax(1)
 
 
+def make_policy(weights, observation_space, action_space):
+    """A policy of the shape of exported weights (`common.load_weights`), for a task with these spaces."""
+    *hidden_layers, _ = (len(w) for name, w in weights.items() if name.startswith("q_network") and w.dim() == 2)
+    scaling = ObservationScaling(observation_space) if "scaling.center" in weights else nn.Identity()
+    return Policy(scaling, QNetwork(math.prod(observation_space.shape), int(action_space.n), hidden_layers))
+
+
 # The replay buffer
 
 
@@ -505,7 +512,7 @@ def main():
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
     if config.evaluate is not None:
         check(config)
-        common.evaluate_policy_file(config, make_env, evaluate, film)
+        common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)
     else:
         train(config)
 

@@ -514,6 +514,14 @@ class Policy(nn.Module):
         return self.center + self.half_range * mean.tanh().unflatten(1, self.center.shape)
 
 
+def make_policy(weights, observation_space, action_space):
+    """A policy of the shape of exported weights (`common.load_weights`), for a task with these spaces."""
+    *hidden_layers, outputs = (len(w) for name, w in weights.items() if name.startswith("actor") and w.dim() == 2)
+    observation_size = math.prod(observation_space.shape)
+    actor = Actor(observation_size, outputs // 2, hidden_layers)
+    return Policy(ObservationScaling(observation_size), actor, action_space)
+
+
 # The replay buffer
 
 
@@ -894,7 +902,7 @@ def main():
         config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
     if config.evaluate is not None:
         check(config)
-        common.evaluate_policy_file(config, make_env, evaluate, film)
+        common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)
     else:
         train(config)
 

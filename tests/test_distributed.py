@@ -174,7 +174,7 @@ def test_evaluation_does_not_depend_on_how_it_is_shared(trained, tmp_path):
     script = checkpoint(run_dir)["script"]
     module = importlib.import_module(script)
     config = checkpoint(run_dir)["shared"]["config"]
-    policy = common.load_policy(run_dir / "policy.pt2")
+    policy = torch.export.load(run_dir / "policy.pt2").module()
     seeds = [common.episode_seed(config["seed"], common.EVALUATION_KEY, i) for i in range(2)]
     returns, _ = zip(*(module.evaluate(policy, config["env_id"], seed) for seed in seeds))
     header, *_, last = rows(run_dir / "eval.csv")

@@ -435,6 +435,16 @@ def test_exported_policy_acts_as_the_policy(tiny_run):
         assert torch.equal(exported(observations), agent.policy(observations))
 
 
+def test_a_policy_without_scaling_is_made_from_its_weights(tmp_path):
+    agent = make_agent(observation_scaling=False)
+    common.PolicyFile(agent.policy, (4,)).save(path := tmp_path / "policy.pt2", agent.policy)
+    with dqn_cartpole.make_env("CartPole-v0") as env:
+        policy = dqn_cartpole.make_policy(weights := common.load_weights(path), env.observation_space, env.action_space)
+    policy.load_state_dict(weights)
+    observations = torch.randn(50, 4)
+    assert torch.equal(policy.q_network(policy.scaling(observations)), agent.q_network(observations))
+
+
 @pytest.mark.parametrize("seed", (0, 1))
 def test_learns_cartpole(seed, tmp_path):
     """195 is the task's own threshold. A random policy stays 22 steps on average.

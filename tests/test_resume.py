@@ -203,7 +203,7 @@ def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
     torch.save(state, tmp_path / "run" / "checkpoint.pt")
     (tmp_path / "run" / "best_policy.pt2").write_bytes(b"of an evaluation to come")
     finish(script, ["--resume", tmp_path / "run"], tmp_path / "output")
-    exported = common.load_policy(tmp_path / "run" / "best_policy.pt2").state_dict()
+    exported = common.load_weights(tmp_path / "run" / "best_policy.pt2")
     assert exported and all(torch.equal(value, best[name]) for name, value in exported.items())
 
 
