@@ -796,6 +796,12 @@ def save_checkpoint(path, script, shared, own, ranks):
         write_atomically(path, functools.partial(torch.save, state))
 
 
+def _require_whole(archive):
+    """Raises ValueError when a record's checksum is wrong, at which torch.load does not look."""
+    if damaged := archive.testzip():
+        raise ValueError(f"{damaged} is damaged")
+
+
 def load_checkpoint(path, script, ranks):
     """Reads back (shared, own) as this rank saved them, on the CPU. Nothing in the file is executed.
 
@@ -803,9 +809,8 @@ def load_checkpoint(path, script, ranks):
     another number of processes.
     """
     try:
-        with zipfile.ZipFile(path) as archive:  # torch.load does not look at the checksums
-            if damaged := archive.testzip():
-                raise ValueError(f"{damaged} is damaged")
+        with zipfile.ZipFile(path) as archive:
+            _require_whole(archive)
         state = torch.load(path, map_location="cpu", weights_only=True)
         format_, found, shared, own = (state[key] for key in ("format", "script", "shared", "ranks"))
     except FileNotFoundError:
@@ -883,8 +888,7 @@ def load_weights(path):
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            if damaged := archive.testzip():
-                raise ValueError(f"{damaged} is damaged")
+            _require_whole(archive)
             folder = f"{archive.namelist()[0].partition('/')[0]}/data/weights"
             weights = {}
             for name, entry in json.loads(archive.read(f"{folder}/model_weights_config.json"))["config"].items():
@@ -963,13 +967,12 @@ def require_finite(step, metrics):
 def evaluate_policy_file(config, make_env, make_policy, evaluate, film):
     """What `--evaluate PATH` does: plays the exported policy's episodes, prints their returns and films one.
 
-    `make_policy(weights, observation_space, action_space)` returns the script's own policy, which then takes the weights.
+    `make_policy(weights, observation_space, action_space)` returns the script's own policy with these weights.
     """
     weights = load_weights(config.evaluate)
     with make_env(config.env_id) as env:
         try:
             policy = make_policy(weights, env.observation_space, env.action_space)
-            policy.load_state_dict(weights)
         except (ValueError, RuntimeError):  # no layers, or others
             raise InputError(f"{config.evaluate} is not a policy for {config.env_id}: name its task with --env-id") from None
     seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]

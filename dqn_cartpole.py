@@ -190,10 +190,15 @@ class Policy(nn.Module):
 
 
 def make_policy(weights, observation_space, action_space):
-    """A policy of the shape of exported weights (`common.load_weights`), for a task with these spaces."""
+    """The policy with exported weights (`common.load_weights`), which tell its layers' sizes too.
+
+    Raises ValueError or RuntimeError when they are of another task than one with these spaces.
+    """
     *hidden_layers, _ = (len(w) for name, w in weights.items() if name.startswith("q_network") and w.dim() == 2)
     scaling = ObservationScaling(observation_space) if "scaling.center" in weights else nn.Identity()
-    return Policy(scaling, QNetwork(math.prod(observation_space.shape), int(action_space.n), hidden_layers))
+    policy = Policy(scaling, QNetwork(math.prod(observation_space.shape), int(action_space.n), hidden_layers))
+    policy.load_state_dict(weights)
+    return policy
 
 
 # The replay buffer

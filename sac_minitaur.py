@@ -515,11 +515,16 @@ class Policy(nn.Module):
 
 
 def make_policy(weights, observation_space, action_space):
-    """A policy of the shape of exported weights (`common.load_weights`), for a task with these spaces."""
+    """The policy with exported weights (`common.load_weights`), which tell its layers' sizes too.
+
+    Raises ValueError or RuntimeError when they are of another task than one with these spaces.
+    """
     *hidden_layers, outputs = (len(w) for name, w in weights.items() if name.startswith("actor") and w.dim() == 2)
     observation_size = math.prod(observation_space.shape)
     actor = Actor(observation_size, outputs // 2, hidden_layers)
-    return Policy(ObservationScaling(observation_size), actor, action_space)
+    policy = Policy(ObservationScaling(observation_size), actor, action_space)
+    policy.load_state_dict(weights)
+    return policy
 
 
 # The replay buffer

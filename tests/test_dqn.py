@@ -439,8 +439,7 @@ def test_a_policy_without_scaling_is_made_from_its_weights(tmp_path):
     agent = make_agent(observation_scaling=False)
     common.PolicyFile(agent.policy, (4,)).save(path := tmp_path / "policy.pt2", agent.policy)
     with dqn_cartpole.make_env("CartPole-v0") as env:
-        policy = dqn_cartpole.make_policy(weights := common.load_weights(path), env.observation_space, env.action_space)
-    policy.load_state_dict(weights)
+        policy = dqn_cartpole.make_policy(common.load_weights(path), env.observation_space, env.action_space)
     observations = torch.randn(50, 4)
     assert torch.equal(policy.q_network(policy.scaling(observations)), agent.q_network(observations))
 

@@ -168,7 +168,6 @@ def test_whole_policy_is_evaluated(script, reference, tmp_path):  # noqa: F811
     with module.make_env(checkpoint(reference)["shared"]["config"]["env_id"]) as env:
         policy = module.make_policy(weights, env.observation_space, env.action_space)
         observations = torch.randn(50, *env.observation_space.shape)
-    policy.load_state_dict(weights)
     assert torch.equal(policy(observations), torch.export.load(reference / "policy.pt2").module()(observations))
 
 
@@ -195,6 +194,8 @@ def hostile_policies(path, created):
             "data/weights/model_weights_config.json": json.dumps(weights),
             "data/weights/weight_0": saved(evil),
         },
+        "weights of an old format": {"data/weights/model.pt": saved(evil)},
+        "constants of an old format": {"data/constants/model.pt": saved(evil)},
     }
     for name, replaced in records.items():
         rewrite(path, target := path.with_name("hostile.pt2"), replaced)
@@ -221,6 +222,10 @@ def test_hostile_policy_is_not_executed(script, reference, tmp_path):  # noqa: F
             torch.export.load(tmp_path / "hostile.pt2").module()(observations)
         assert created.exists(), name
         created.unlink()
+    path.write_bytes(pickle.dumps(CreatesFile(created)))
+    with pytest.raises(common.InputError):
+        common.load_weights(path)
+    assert not created.exists()
 
 
 # Disks
