@@ -973,7 +973,7 @@ def evaluate_policy_file(config, make_env, make_policy, evaluate, film):
     with make_env(config.env_id) as env:
         try:
             policy = make_policy(weights, env.observation_space, env.action_space)
-        except (ValueError, RuntimeError):  # no layers, or others
+        except (KeyError, ValueError, RuntimeError):  # no layers, or others
             raise InputError(f"{config.evaluate} is not a policy for {config.env_id}: name its task with --env-id") from None
     seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
     returns, lengths = zip(*(evaluate(policy, config.env_id, seed) for seed in tqdm(seeds, disable=None)))

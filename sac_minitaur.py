@@ -517,12 +517,13 @@ class Policy(nn.Module):
 def make_policy(weights, observation_space, action_space):
     """The policy with exported weights (`common.load_weights`), which tell its layers' sizes too.
 
-    Raises ValueError or RuntimeError when they are of another task than one with these spaces.
+    Raises KeyError, ValueError or RuntimeError when they are of another task than one with these spaces.
     """
     *hidden_layers, outputs = (len(w) for name, w in weights.items() if name.startswith("actor") and w.dim() == 2)
     observation_size = math.prod(observation_space.shape)
     actor = Actor(observation_size, outputs // 2, hidden_layers)
-    policy = Policy(ObservationScaling(observation_size), actor, action_space)
+    scaling = ObservationScaling(weights["scaling.mean"].numel())  # of what only the critics see as well
+    policy = Policy(scaling, actor, action_space)
     policy.load_state_dict(weights)
     return policy
 

@@ -739,8 +739,12 @@ def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path, p
         assert torch.equal(next_observations[:, 2], 100 + next_observations[:, 1])
     assert shared["agent"]["critics"]["q1.1.weight"].shape == (16, size + 1)
     assert shared["agent"]["actor"]["net.0.weight"].shape == (16, 2)
-    policy = torch.export.load(path / "policy.pt2").module()
-    assert policy(torch.zeros(1, 2)).shape == (1, 1)
+    observations = torch.rand(5, 2)
+    exported = torch.export.load(path / "policy.pt2").module()(observations)
+    with sac_minitaur.make_env(f"{__name__}:Telling-v0") as env:  # as `--evaluate` reads it
+        weights = common.load_weights(path / "policy.pt2")
+        policy = sac_minitaur.make_policy(weights, env.observation_space, env.action_space)
+    assert exported.shape == (5, 1) and torch.equal(policy(observations), exported)
 
 
 # Exported policies
