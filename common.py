@@ -21,7 +21,6 @@ import signal
 import sys
 import threading
 import time
-import typing
 import zipfile
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
@@ -515,9 +514,7 @@ class Run:
             self.path = Path(config.resume)
             shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
             self.checkpoint = shared | own
-            for name, saved in self.checkpoint["config"].items():
-                if name not in (*HARMLESS_FIELDS, "run_dir", "num_iterations") and saved != getattr(config, name, None):
-                    raise InputError(f"{self.path}/checkpoint.pt is another run's: its {name} is {saved}")
+            require_same_run(config, shared["config"])
         else:
             # To the microsecond, for runs that are started at once.
             default = Path("runs") / f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
@@ -542,22 +539,16 @@ class Run:
     def __enter__(self):
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)
-        with self.stack:  # ended here only if the directory cannot be written
-            self.stack.callback(self.evaluations.close)
-            self.enter(self.stop)
-            if self.writes:
-                if self.config.resume is not None:
-                    self._rewrite_tables()
-                self._save_config()
-            self.progress = self.enter(
-                tqdm(
-                    total=self.config.num_iterations,
-                    initial=self.checkpoint.get("step", 0),
-                    unit="step",
-                    disable=not (self.writes and sys.stderr.isatty()),
-                )
+        self.stack.callback(self.evaluations.close)
+        self.enter(self.stop)
+        self.progress = self.enter(
+            tqdm(
+                total=self.config.num_iterations,
+                initial=self.checkpoint.get("step", 0),
+                unit="step",
+                disable=not (self.writes and sys.stderr.isatty()),
             )
-            self.stack = self.stack.pop_all()
+        )
         return self
 
     def enter(self, context):
@@ -595,8 +586,14 @@ class Run:
             for row in rows:
                 self._write_summary(name, row)
 
-    def print_start(self, observation_space, action_space, buffer_bytes):
-        """Says what is trained, on what, and where it is written."""
+    def start(self, observation_space, action_space, buffer_bytes):
+        """Begins the files anew, with what the checkpoint has of them, and says what is trained, on what, and where.
+
+        Called when all that the user gave has been found usable: until then a new directory is left empty.
+        """
+        if self.writes:
+            self._rewrite_tables()
+            self._save_config()
         config = self.config
         processes = f", process 0 of {self.ranks.world_size}" if self.ranks.world_size > 1 else ""
         with np.printoptions(precision=2, threshold=8, edgeitems=2):
@@ -828,38 +825,28 @@ def first_line(error):
     return (str(error).splitlines() or [type(error).__name__])[0][:150]
 
 
-def resumed_config(config, parse):
-    """The config that `--resume` continues with: the saved one, with what the command line changes.
+def resumed_config(config, script):
+    """`config` with the values saved in the checkpoint that it resumes, for the command line to be read over.
 
-    `parse(default)` reads the command line over the defaults given. `num_iterations` may grow; the harmless fields
-    may differ. Raises InputError naming the first field that may not.
+    Raises InputError when there is none, or one of another version of the script: its defaults need not be today's.
     """
-    path = Path(config.resume) / "config.json"
-    try:
-        saved = json.loads(path.read_text())
-        fields = dataclasses.fields(config)
-        missing = [field.name for field in fields if field.name not in saved]
-        if missing:  # another version of the script wrote it: today's default need not be what it did
-            raise ValueError(f"it has no {missing[0]}")
-        saved = type(config)(**{key: tuple(v) if isinstance(v, list) else v for key, v in saved.items()})
-        for field in fields:
-            value = getattr(saved, field.name)
-            kind = tuple if typing.get_origin(field.type) is tuple else field.type
-            if not isinstance(value, kind) and not (kind is float and isinstance(value, int)):
-                raise TypeError(f"{field.name} is {value!r}")
-    except FileNotFoundError:
-        raise InputError(f"--resume {config.resume}: there is no run there (no {path.name})") from None
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is not the config of a run of this script ({first_line(error)})") from None
-    config = parse(dataclasses.replace(saved, resume=config.resume))
-    for field in fields:
-        old, new = getattr(saved, field.name), getattr(config, field.name)
-        flag = "--" + field.name.replace("_", "-")
-        if field.name == "num_iterations" and new < old:
-            raise InputError(f"{flag} {new} is less than the {old} of the run to resume: it may only be raised")
-        if old != new and field.name not in (*HARMLESS_FIELDS, "num_iterations"):
+    path = Path(config.resume) / "checkpoint.pt"
+    shared, _ = load_checkpoint(path, script, Ranks.join())
+    if others := dataclasses.asdict(config).keys() ^ shared["config"].keys():
+        raise InputError(f"{path} was saved by another version of {script}.py, which differs in the field {min(others)}")
+    return dataclasses.replace(config, **shared["config"] | {"resume": config.resume})
+
+
+def require_same_run(config, saved):
+    """Raises InputError naming the first field of `config` that keeps it from continuing the one `saved`, a dict."""
+    if config.num_iterations < saved["num_iterations"]:
+        less = f"{config.num_iterations} is less than the {saved['num_iterations']} of the run to resume"
+        raise InputError(f"--num-iterations {less}: it may only be raised")
+    may_differ = (*HARMLESS_FIELDS, "num_iterations", *(["run_dir"] if config.run_dir in (None, config.resume) else []))
+    for name, new in dataclasses.asdict(config).items():
+        if name not in may_differ and new != (old := saved.get(name)):
+            flag = "--" + name.replace("_", "-")
             raise InputError(f"{flag} {new} differs from the {old} of the run to resume: leave it out")
-    return config
 
 
 class PolicyFile:

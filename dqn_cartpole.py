@@ -407,12 +407,13 @@ def check(config):
     """Raises InputError for a value that no run could use."""
     common.require_range(
         config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
-        "replay_buffer_capacity", "batch_size", "learning_rate_decay", "layers", "num_threads", "log_interval",
+        "replay_buffer_capacity", "batch_size", "learning_rate_decay", "layers", "log_interval",
         "eval_interval", "num_eval_episodes", "checkpoint_interval",
     )  # fmt: skip
     common.require_range(config, 0, math.inf, "learning_rate", "adam_epsilon")
     common.require_range(config, 0, 1, "epsilon", "gamma", "target_update_tau")
     common.require_range(config, 0, 2**63 - 1, "seed")
+    common.require_range(config, 1, 1024, "num_threads")
     common.require_batch(config)
     if not 0 <= config.advantage_learning < 1:
         raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
@@ -447,7 +448,7 @@ def train(config):
         buffer = ReplayBuffer(config.replay_buffer_capacity, agent.observation_size, run.device)
         policy_file = common.PolicyFile(agent.policy, observation_space.shape)
         torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
-        run.print_start(observation_space, action_space, buffer.rows.nbytes)
+        run.start(observation_space, action_space, buffer.rows.nbytes)
 
         step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
         if saved:
@@ -465,8 +466,7 @@ def train(config):
             own = {"buffer": buffer.state(), "episodes": episodes.state(), "random": common.random_state()}
             run.save_checkpoint(shared, own)
 
-        if not saved:
-            save()
+        save()
         last_saved = step
         stopping = False
         steps_per_round = config.num_envs * ranks.world_size
@@ -514,7 +514,7 @@ def train(config):
 def main():
     config = tyro.cli(Config, description=__doc__)
     if config.resume is not None:
-        config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
+        config = tyro.cli(Config, description=__doc__, default=common.resumed_config(config, "dqn_cartpole"))
     if config.evaluate is not None:
         check(config)
         common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)

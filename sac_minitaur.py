@@ -792,7 +792,7 @@ def check(config):
     """Raises InputError for a value that no run could use."""
     common.require_range(
         config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
-        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "num_threads", "log_interval",
+        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "log_interval",
         "eval_interval", "num_eval_episodes", "checkpoint_interval",
     )  # fmt: skip
     common.require_range(
@@ -803,6 +803,7 @@ def check(config):
     common.require_range(config, 0, math.nextafter(1, 0), "adam_beta1")
     common.require_range(config, -math.inf, math.inf, "target_entropy_per_action", "initial_log_alpha")
     common.require_range(config, 0, 2**63 - 1, "seed")
+    common.require_range(config, 1, 1024, "num_threads")
     # Every environment's last transitions are not complete yet.
     common.require_batch(config, held_back=config.num_envs * (config.n_step - 1))
 
@@ -833,7 +834,7 @@ def train(config):
         )  # fmt: skip
         policy_file = common.PolicyFile(agent.policy, observation_space.shape)
         torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
-        run.print_start(observation_space, action_space, buffer.rows.nbytes)
+        run.start(observation_space, action_space, buffer.rows.nbytes)
 
         step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
         if saved:
@@ -851,8 +852,7 @@ def train(config):
             own = {"buffer": buffer.state(), "episodes": episodes.state(), "random": common.random_state()}
             run.save_checkpoint(shared, own)
 
-        if not saved:
-            save()
+        save()
         last_saved = step
         stopping = False
         steps_per_round = config.num_envs * ranks.world_size
@@ -905,7 +905,7 @@ def train(config):
 def main():
     config = tyro.cli(Config, description=__doc__)
     if config.resume is not None:
-        config = common.resumed_config(config, lambda saved: tyro.cli(Config, default=saved))
+        config = tyro.cli(Config, description=__doc__, default=common.resumed_config(config, "sac_minitaur"))
     if config.evaluate is not None:
         check(config)
         common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)

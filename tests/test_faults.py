@@ -97,12 +97,6 @@ def change(path, **values):
     torch.save(torch.load(path, weights_only=True) | values, path)
 
 
-def change_config(path, **values):
-    state = torch.load(path, weights_only=True)
-    state["shared"]["config"] |= values
-    torch.save(state, path)
-
-
 @pytest.fixture
 def copy(reference, tmp_path):  # noqa: F811
     """A finished run, to be damaged."""
@@ -119,28 +113,22 @@ def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
             common.load_checkpoint(copy / "checkpoint.pt", script, common.Ranks())
         assert "\n" not in str(error.value), name
     assert_one_line(Process(script, ["--resume", copy], tmp_path / "missing"), 2, "checkpoint.pt")
-    (copy / "checkpoint.pt").write_bytes(whole)
-    change_config(copy / "checkpoint.pt", env_id="Ant-v5")
-    assert_one_line(Process(script, ["--resume", copy], tmp_path / "foreign"), 2, "env_id is Ant-v5")
 
 
-def test_damaged_config(script, copy, tmp_path):  # noqa: F811
-    config = json.loads((copy / "config.json").read_text())
+def test_checkpoint_of_another_version(script, copy, tmp_path):  # noqa: F811
+    """It has a field more or one less: what that would have to be, nobody knows."""
+    path = copy / "checkpoint.pt"
+    state = torch.load(path, weights_only=True)
+    config = state["shared"]["config"]
     older = {name: value for name, value in config.items() if name != "observation_scaling"}
-    changed = older, config | {"wings": 2}, config | {"num_iterations": "many"}
-    texts = "", "[1, 2]", *map(json.dumps, changed)
-    config_type = importlib.import_module(script).Config
-    for text in texts:
-        (copy / "config.json").write_text(text)
-        with pytest.raises(common.InputError, match="config.json") as error:
-            common.resumed_config(config_type(resume=str(copy)), lambda saved: saved)
-        assert "\n" not in str(error.value)
-    assert_one_line(Process(script, ["--resume", copy], tmp_path / "output"), 2, "config.json")
+    for changed, field in ((older, "observation_scaling"), (config | {"wings": 2}, "wings")):
+        torch.save(state | {"shared": state["shared"] | {"config": changed}}, path)
+        assert_one_line(Process(script, ["--resume", copy], tmp_path / field), 2, "checkpoint.pt", "version", field)
 
 
 def test_one_script_does_not_continue_the_other(script, reference, tmp_path):  # noqa: F811
     other = SCRIPTS[1 - SCRIPTS.index(script)]
-    assert_one_line(Process(other, ["--resume", reference], tmp_path / "resume"), 2, "config.json")
+    assert_one_line(Process(other, ["--resume", reference], tmp_path / "resume"), 2, f"checkpoint of {script}")
     run = Process(other, ["--evaluate", reference / "policy.pt2", "--no-video", *TASK[other]], tmp_path / "evaluate")
     assert_one_line(run, 2, "policy.pt2", "--env-id")
 

@@ -184,15 +184,21 @@ def assert_tensorboard_once(run_dir):
 
 
 def test_raised_run_equals_a_longer_one(script, reference, tmp_path):
-    """Also when the shorter one ended with an evaluation of its own, and when resuming is all that is done by hand."""
+    """Also when the shorter one ended with an evaluation of its own, and when the longer one is killed at once."""
     shorter = flags(script, tmp_path / "run", "--num-envs", 2, "--num-iterations", 190)
     finish(script, shorter, tmp_path / "shorter")
     assert rows(tmp_path / "run" / "eval.csv")[-1][0] == "190"
+    raised = ["--resume", tmp_path / "run", "--num-iterations", 300]
+    assert Process(script, raised, tmp_path / "raised", updating_a_little).wait() == -signal.SIGKILL
     # The real command, in a new interpreter.
-    command = [sys.executable, ROOT / f"{script}.py", "--resume", tmp_path / "run", "--num-iterations", "300"]
+    command = [sys.executable, ROOT / f"{script}.py", "--resume", tmp_path / "run"]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert_same_run(tmp_path / "run", reference)
+
+
+def updating_a_little(module):
+    before_update(module, 5, die)
 
 
 def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
@@ -274,29 +280,29 @@ def interrupt_twice(module):
 def test_every_other_change_is_refused(script, reference):
     """In one line that names the field."""
     module = importlib.import_module(script)
-    asked = module.Config(resume=str(reference))
-    unchanged = common.resumed_config(asked, lambda saved: saved)
-    for field in dataclasses.fields(module.Config):
-        value = getattr(unchanged, field.name)
+    config = common.resumed_config(module.Config(resume=str(reference)), script)
+    saved = checkpoint(reference)["shared"]["config"]
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
         if isinstance(value, bool):
             changed = not value
         elif isinstance(value, tuple):
             changed = (*value, 8)
         else:
             changed = f"{value}x" if isinstance(value, str | None) else value + 1
-        change = partial(dataclasses.replace, **{field.name: changed})
+        continued = dataclasses.replace(config, **{field.name: changed})
         if field.name in ("resume", "evaluate", "video", "checkpoint_interval", "num_iterations"):
-            assert getattr(common.resumed_config(asked, change), field.name) == changed
+            common.require_same_run(continued, saved)
         else:
             with pytest.raises(common.InputError) as error:
-                common.resumed_config(asked, change)
+                common.require_same_run(continued, saved)
             assert f"--{field.name.replace('_', '-')} " in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(common.InputError, match="--num-iterations 299 is less than the 300"):
-        common.resumed_config(asked, partial(dataclasses.replace, num_iterations=299))
+        module.train(dataclasses.replace(config, num_iterations=299))
 
 
 def test_refusal_at_the_command_line(script, reference, tmp_path):
-    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "no run there")):
+    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "does not exist")):
         run = Process(script, ["--resume", *arguments], tmp_path / word)
         assert run.wait() == 2
         assert run.stderr.count("\n") == 1 and run.stderr.startswith("error: ") and word in run.stderr
