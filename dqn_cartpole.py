@@ -66,19 +66,21 @@ class Config:
     """ours (theirs: 1): step of the target network towards the Q-network, after every update"""
     value_offset: bool = True
     """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
+    # Adam moves an output at the pace of its learning rate, whatever the output's unit: for values tens apart, a unit of
+    # one reward is a long way.
     value_scale: float = 100.0
-    """ours (theirs: 1): Q changes by this where the network's output changes by 1. Adam moves an output at the pace of
-    its learning rate, whatever the output's unit: for values tens apart, a unit of one reward is a long way"""
+    """ours (theirs: 1): Q changes by this where the network's output changes by 1"""
     value_bound: bool = True
     """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth, for ever or once"""
+    # The other action comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's
+    # errors.
     advantage_learning: float = 0.9
-    """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one. The other action
-    comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's errors"""
+    """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one"""
     layers: tuple[int, ...] = (100, 50)
     """hidden units of the Q-network"""
+    # The pole's angle ends at 0.2 and the cart's place at 2.4: unscaled, the network sees ten times as much of the place.
     observation_scaling: bool = True
-    """ours (theirs: none): observations come within [-1, 1] where the task bounds them. The pole's angle ends at 0.2
-    and the cart's place at 2.4: unscaled, the network sees ten times as much of the place"""
+    """ours (theirs: none): observations come within [-1, 1] where the task bounds them"""
 
     seed: int = 0
     """source of all randomness"""

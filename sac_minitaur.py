@@ -57,30 +57,31 @@ class Config:
     """Adam's ε (Keras' default, which the tutorials leave unsaid)"""
     adam_beta1: float = 0.5
     """ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient"""
+    # States of very different value look alike in the robot's observation. The policy sees no more than the task gives.
     privileged_critics: bool = True
-    """ours (theirs: no): the critics see what the task's observation lacks, where the environment tells (the Minitaur's
-    velocity and height). The actor does not, so that the policy needs no more than the task gives (arXiv:1710.06542)"""
+    """ours (theirs: no): critics see the velocity and height too, where the environment tells them (arXiv:1710.06542)"""
+    # What is learned counts at the next update then. With target critics that takes a fifth of the run.
     critic_batch_norm: bool = True
-    """ours (theirs: none): normalize the critics' layers over the batch and do without target critics, as CrossQ
-    (arXiv:1902.05605): what is learned then counts at the next update, not a fifth of the run later"""
+    """ours (theirs: none): normalize the critics over the batch, without target critics (CrossQ, arXiv:1902.05605)"""
     target_update_tau: float = 0.005
     """step of the target critics, where there are any, towards the critics, after every update"""
     gamma: float = 0.99
     """discount"""
+    # One step of 0.01 s changes the return so little that the critics' errors hide it.
     n_step: int = 3
-    """ours (theirs: 1): environment steps whose rewards a target sums before it bootstraps. One step of 0.01 s changes
-    the return so little that the critics' errors hide it"""
+    """ours (theirs: 1): environment steps whose rewards a target sums before it bootstraps"""
+    # Values of a thousandth are lost in the noise of new critics.
     reward_scaling: bool = True
-    """ours (theirs: none): divide the rewards by the standard deviation of the initial random data's n-step
-    returns, here 0.005: values of a thousandth are lost in the noise of new critics"""
+    """ours (theirs: none): divide the rewards by the spread of the initial random data's n-step returns, here 0.005"""
     reward_scale_factor: float = 0.5
     """ours (theirs: 1): factor of the rewards, after the division"""
+    # Every step of Adam changes the actor a little everywhere, and that of one moment may fall. Its average acts wherever
+    # no action is sampled.
     averaged_actor_tau: float = 0.005
-    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update. It acts
-    where no action is sampled: every step of Adam changes the actor a little everywhere, and that of one moment may fall"""
+    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update"""
+    # So that the replay holds the states that the policy, as it is evaluated, leads to.
     mean_action_episodes: bool = True
-    """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean
-    action, so that the replay holds the states that it leads to"""
+    """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean action"""
     critic_loss_weight: float = 0.5
     """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
     target_entropy_per_action: float = -1.0
