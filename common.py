@@ -35,8 +35,6 @@ import torch.distributed as dist
 from tqdm import tqdm
 
 CHECKPOINT_FORMAT = 1
-# Fields of a config that a resumed run may change: they decide what is done besides, not what is learned.
-HARMLESS_FIELDS = ("resume", "evaluate", "video", "checkpoint_interval")
 # Sets the seeds of evaluation episodes apart from those of training, whose second number counts environments.
 EVALUATION_KEY = 2**32 - 1
 # Workers are forked where that is safe: they start at once and share the memory of the imported libraries. They never
@@ -842,7 +840,10 @@ def require_same_run(config, saved):
     if config.num_iterations < saved["num_iterations"]:
         less = f"{config.num_iterations} is less than the {saved['num_iterations']} of the run to resume"
         raise InputError(f"--num-iterations {less}: it may only be raised")
-    may_differ = (*HARMLESS_FIELDS, "num_iterations", *(["run_dir"] if config.run_dir in (None, config.resume) else []))
+    # All but the iterations decide what is done besides, not what is learned.
+    may_differ = {"num_iterations", "resume", "evaluate", "video", "checkpoint_interval"}
+    if config.run_dir in (None, config.resume):  # no other directory is asked for
+        may_differ.add("run_dir")
     for name, new in dataclasses.asdict(config).items():
         if name not in may_differ and new != (old := saved.get(name)):
             flag = "--" + name.replace("_", "-")

@@ -516,7 +516,7 @@ def train(config):
 def main():
     config = tyro.cli(Config, description=__doc__)
     if config.resume is not None:
-        config = tyro.cli(Config, description=__doc__, default=common.resumed_config(config, "dqn_cartpole"))
+        config = tyro.cli(Config, default=common.resumed_config(config, "dqn_cartpole"))
     if config.evaluate is not None:
         check(config)
         common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)
