@@ -90,6 +90,21 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
+def print_stretches(experiment, ends):
+    """The mean of each seed's evaluations from one of the steps `ends`, which it leaves out, up to the next."""
+    titles = [f"{start} to {end}" for start, end in zip(ends, ends[1:])]
+    print(f"\n### {experiment}, means\n\n| seed | at {ends[0]} | {' | '.join(titles)} | last | its step | best |")
+    print(f"|{' --- |' * (len(ends) + 4)}")
+    for seed, rows in runs(experiment).items():
+        at = returns_by_step(rows)
+        cells = [at[ends[0]]]
+        for start, end in zip(ends, ends[1:]):
+            within = [value for step, value in at.items() if start < step <= end]
+            cells.append(sum(within) / len(within) if within else math.nan)
+        last = f"{rows[-1]['average_return']:.2f} ± {rows[-1]['std_return']:.2f} | {rows[-1]['step']:.0f}"
+        print(f"| {seed} | {' | '.join(map(number, cells))} | {last} | {max(at.values()):.2f} |")
+
+
 def print_ablation(base, step, more):
     """Returns after `step` updates of `base`, of the runs without one choice, and of `more`, with the seeds of all."""
     without = f"{base}_without_"
@@ -130,6 +145,8 @@ def main():
     for path in sorted(RESULTS.glob("sac*")):
         if path.is_dir() and "_without_" not in path.name:
             print_table(path.name, goal=15, late=50_000)
+    for path in sorted(RESULTS.glob("sac*_long")):
+        print_stretches(path.name, (100_000, 200_000, 400_000, 600_000, 800_000, 1_000_000))
     exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
     print_ablation("sac_minitaur", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
     print_ablation("sac_unprivileged", 30_000, {})
