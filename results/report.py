@@ -6,8 +6,9 @@ TF-Agents tutorials print.
 
 import csv
 import math
+from itertools import pairwise
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 from matplotlib.figure import Figure
 
@@ -69,6 +70,10 @@ def number(value, digits=2):
     return f"{value:.{digits}f}" if math.isfinite(value) else "–"
 
 
+def with_spread(row):
+    return f"{row['average_return']:.2f} ± {row['std_return']:.2f}"
+
+
 def print_table(experiment, goal, late):
     """One row for each seed: `goal` is the return to reach, `late` the step from which the worst evaluation counts."""
     columns = f"at 10000 | at 20000 | final return | episode length | best | worst from {late} on | first ≥ {goal}"
@@ -83,26 +88,24 @@ def print_table(experiment, goal, late):
         # An untrained network may balance by luck (DQN's seed 4).
         first = next((step for step, value in at.items() if step > 0 and value >= goal), math.inf)
         summary.append((early, later, final, length, best, worst, first))
-        spread = f"{final:.2f} ± {rows[-1]['std_return']:.2f}"
-        print(f"| {seed} | {number(early)} | {number(later)} | {spread} | {length:.0f}", end="")
+        print(f"| {seed} | {number(early)} | {number(later)} | {with_spread(rows[-1])} | {length:.0f}", end="")
         print(f" | {best:.2f} | {number(worst)} | {number(first, 0)} |")
     medians = (number(median(column), digits) for column, digits in zip(zip(*summary), (2, 2, 2, 0, 2, 2, 0)))
     print(f"| median | {' | '.join(medians)} |")
 
 
 def print_stretches(experiment, ends):
-    """The mean of each seed's evaluations from one of the steps `ends`, which it leaves out, up to the next."""
-    titles = [f"{start} to {end}" for start, end in zip(ends, ends[1:])]
+    """The mean of each seed's evaluations after each of the steps `ends`, up to and with the next."""
+    stretches = list(pairwise(ends))
+    titles = [f"{start} to {end}" for start, end in stretches]
     print(f"\n### {experiment}, means\n\n| seed | at {ends[0]} | {' | '.join(titles)} | last | its step | best |")
     print(f"|{' --- |' * (len(ends) + 4)}")
     for seed, rows in runs(experiment).items():
         at = returns_by_step(rows)
-        cells = [at[ends[0]]]
-        for start, end in zip(ends, ends[1:]):
-            within = [value for step, value in at.items() if start < step <= end]
-            cells.append(sum(within) / len(within) if within else math.nan)
-        last = f"{rows[-1]['average_return']:.2f} ± {rows[-1]['std_return']:.2f} | {rows[-1]['step']:.0f}"
-        print(f"| {seed} | {' | '.join(map(number, cells))} | {last} | {max(at.values()):.2f} |")
+        within = [[value for step, value in at.items() if start < step <= end] for start, end in stretches]
+        means = [mean(values) if values else math.nan for values in within]
+        print(f"| {seed} | {' | '.join(map(number, [at[ends[0]], *means]))}", end="")
+        print(f" | {with_spread(rows[-1])} | {rows[-1]['step']:.0f} | {max(at.values()):.2f} |")
 
 
 def print_ablation(base, step, more):
