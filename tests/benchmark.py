@@ -7,7 +7,9 @@ Every figure is the median of `REPEATS` rounds in which all the candidates are m
 drift of the machine's speed touches all alike. Quote the ratios rather than the milliseconds.
 """
 
+import csv
 import importlib.util
+import math
 import os
 import platform
 import statistics
@@ -29,6 +31,16 @@ import sac_minitaur  # noqa: E402
 
 REPEATS = 3
 TRAINING_STEPS = 1_000
+UPRIGHT = "MinitaurThatNeverFalls-v0"
+
+
+class MinitaurThatNeverFalls(sac_minitaur.MinitaurBulletEnv):
+    """Every episode has its 1 000 steps, as a trained robot's, so that all candidates evaluate equally much."""
+
+    MIN_UPRIGHTNESS = MIN_HEIGHT = -math.inf
+
+
+gym.register(UPRIGHT, MinitaurThatNeverFalls, max_episode_steps=1000)
 
 
 def milliseconds(function, calls):
@@ -77,48 +89,47 @@ def update_candidates():
 
 
 def run(*command):
-    """Milliseconds that a command takes as a whole process."""
-    start = time.perf_counter()
-    subprocess.run([sys.executable, *map(str, command)], cwd=ROOT, check=True, capture_output=True)
-    return (time.perf_counter() - start) * 1e3
+    """What a Python command prints, run in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    command = [sys.executable, *map(str, command)]
+    return subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
 
 
 def training(evaluations, *flags):
-    """Milliseconds an iteration: a long run less a short one, so that start-up and initial collection cancel.
+    """Milliseconds an iteration by the run's own clock, from `TRAINING_STEPS` updates to twice as many.
 
-    With `evaluations` there are 2 episodes for every 1 000 iterations, which is the default command's 20 for 10 000.
+    By then the evaluations before the first update are over. With `evaluations` there are 2 episodes for every 1 000
+    iterations, which is the default command's 20 for 10 000: all that start in this time end in it.
     """
-    times = []
-    for iterations in (100 + TRAINING_STEPS, 100):
-        with tempfile.TemporaryDirectory() as directory:
-            times.append(
-                run(
-                    "sac_minitaur.py", "--num-iterations", iterations, "--initial-collect-steps", 500, "--no-video",
-                    "--eval-interval", 1_000 if evaluations else 1_000_000, "--num-eval-episodes", 2 if evaluations else 1,
-                    "--run-dir", Path(directory) / "run", *flags,
-                )  # fmt: skip
-            )
-    return (times[0] - times[1]) / TRAINING_STEPS
+    with tempfile.TemporaryDirectory() as directory:
+        run(
+            "sac_minitaur.py", "--env-id", f"benchmark:{UPRIGHT}", "--num-iterations", 2 * TRAINING_STEPS,
+            "--initial-collect-steps", 500, "--log-interval", TRAINING_STEPS, "--no-video",
+            "--eval-interval", 1_000 if evaluations else 1_000_000, "--num-eval-episodes", 2 if evaluations else 1,
+            "--run-dir", Path(directory) / "run", *flags,
+        )  # fmt: skip
+        with open(Path(directory) / "run" / "train.csv") as file:
+            start, end = (float(row["seconds"]) for row in csv.DictReader(file))
+    return (end - start) / TRAINING_STEPS * 1e3
 
 
 def peer_training(module, evaluations):
     """The same of `SAC` of stable_baselines3 or sbx, with the tutorials' sizes, in a process of its own."""
     code = f"""
-import time, torch, sac_minitaur, gymnasium as gym
+import time, torch, gymnasium as gym
 from {module} import SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 torch.set_num_threads(2)
-env, eval_env = gym.make("MinitaurBulletEnv-v0"), Monitor(gym.make("MinitaurBulletEnv-v0"))
-callback = EvalCallback(eval_env, n_eval_episodes=2, eval_freq=1000, verbose=0) if {evaluations} else None
+env, eval_env = (gym.make("benchmark:{UPRIGHT}") for _ in range(2))
+callback = EvalCallback(Monitor(eval_env), n_eval_episodes=2, eval_freq=1000, verbose=0) if {evaluations} else None
 model = SAC("MlpPolicy", env, learning_starts=500, batch_size=256, buffer_size=100_000)
 model.learn(600)
 start = time.perf_counter()
 model.learn({TRAINING_STEPS}, reset_num_timesteps=False, callback=callback)
 print((time.perf_counter() - start) / {TRAINING_STEPS} * 1e3)
 """
-    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    return float(out.splitlines()[-1])
+    return float(run("-c", code).splitlines()[-1])
 
 
 def training_candidates(evaluations):
@@ -132,7 +143,7 @@ def training_candidates(evaluations):
 
 def dqn():
     with tempfile.TemporaryDirectory() as directory:
-        return run("dqn_cartpole.py", "--no-video", "--run-dir", Path(directory) / "run")
+        return milliseconds(lambda: run("dqn_cartpole.py", "--no-video", "--run-dir", Path(directory) / "run"), 1)
 
 
 def main():
