@@ -1,6 +1,6 @@
 """Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
 
-    python tests/benchmark.py                  # a few minutes, 15 with both peers; nothing else should run on the machine
+    python tests/benchmark.py                  # ten minutes, 16 with both peers; nothing else should run on the machine
     pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
 
 Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
