@@ -90,8 +90,8 @@ def update_candidates():
 
 def run(*command):
     """What a Python command prints, run in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
     command = [sys.executable, *map(str, command)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "tests")}  # for the task registered above
     return subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
 
 
