@@ -1,6 +1,6 @@
 """Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
 
-    python tests/benchmark.py                  # ten minutes, 16 with both peers; nothing else should run on the machine
+    python tests/benchmark.py                  # twelve minutes, 18 with both peers; nothing else should run on the machine
     pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
 
 Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
@@ -84,7 +84,7 @@ def update_candidates():
 
     normalized, plain = new_agent(config), new_agent(sac_minitaur.Config(critic_batch_norm=False))
     yield "1 thread", lambda: update(normalized, 1)
-    yield "1 thread, target critics instead", lambda: update(plain, 1)  # of batch normalization, as in the tutorials
+    yield "1 thread, target critics", lambda: update(plain, 1)  # not batch normalization, as in the tutorials
     yield "2 threads", lambda: update(normalized, 2)
 
 
@@ -133,17 +133,24 @@ print((time.perf_counter() - start) / {TRAINING_STEPS} * 1e3)
 
 
 def training_candidates(evaluations):
-    """Ours on one and two threads, and the peers that are installed."""
+    """Ours on one and two threads, ours as plain SAC, and the peers that are installed, which run that."""
     yield "ours, 1 thread", lambda: training(evaluations)
+    yield "ours, 1 thread, target critics", lambda: training(evaluations, "--no-critic-batch-norm")
     yield "ours, 2 threads", lambda: training(evaluations, "--num-threads", 2)
     for name, module in (("Stable-Baselines3", "stable_baselines3"), ("SBX", "sbx")):
         if importlib.util.find_spec(module):
             yield f"{name}, 2 threads", lambda module=module: peer_training(module, evaluations)
 
 
-def dqn():
+def dqn(*flags):
     with tempfile.TemporaryDirectory() as directory:
-        return milliseconds(lambda: run("dqn_cartpole.py", "--no-video", "--run-dir", Path(directory) / "run"), 1)
+        command = "dqn_cartpole.py", "--no-video", "--run-dir", Path(directory) / "run", *flags
+        return milliseconds(lambda: run(*command), 1)
+
+
+def dqn_candidates():
+    yield "20 000 updates", dqn
+    yield "1 update", lambda: dqn("--num-iterations", 1)  # so this much is start-up
 
 
 def main():
@@ -154,7 +161,7 @@ def main():
         ("SAC update, batch 256", update_candidates()),
         ("SAC training, an iteration without evaluations", training_candidates(evaluations=False)),
         ("SAC, an iteration of the whole job", training_candidates(evaluations=True)),
-        ("DQN, the whole default command", iter([("ours", dqn)])),
+        ("DQN, the default command but for the videos", dqn_candidates()),
     ):
         result = medians(dict(candidates))
         print(f"\n{title}")
