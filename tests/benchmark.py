@@ -1,6 +1,6 @@
 """Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
 
-    python tests/benchmark.py                  # twelve minutes, 18 with both peers; nothing else should run on the machine
+    python tests/benchmark.py                  # 12 minutes, 18 with both peers; nothing else should run on the machine
     pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
 
 Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
@@ -84,7 +84,7 @@ def update_candidates():
 
     normalized, plain = new_agent(config), new_agent(sac_minitaur.Config(critic_batch_norm=False))
     yield "1 thread", lambda: update(normalized, 1)
-    yield "1 thread, target critics", lambda: update(plain, 1)  # not batch normalization, as in the tutorials
+    yield "1 thread, target critics", lambda: update(plain, 1)  # as in the tutorials, in place of batch normalization
     yield "2 threads", lambda: update(normalized, 2)
 
 
@@ -133,7 +133,7 @@ print((time.perf_counter() - start) / {TRAINING_STEPS} * 1e3)
 
 
 def training_candidates(evaluations):
-    """Ours on one and two threads, ours as plain SAC, and the peers that are installed, which run that."""
+    """Ours on one and two threads, ours with target critics, and the peers that are installed, which have these too."""
     yield "ours, 1 thread", lambda: training(evaluations)
     yield "ours, 1 thread, target critics", lambda: training(evaluations, "--no-critic-batch-norm")
     yield "ours, 2 threads", lambda: training(evaluations, "--num-threads", 2)
