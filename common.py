@@ -1,144 +1,163 @@
-"""What both training scripts need and what can be specified without knowing the algorithm.
+"""What both training scripts need besides their algorithms.
 
-Devices and processes, the run directory with its metrics, plots, videos, exported policies and checkpoint files.
-No network, loss or replay buffer is defined here.
+The command line, devices and processes, tasks and their workers, and the run directory with its tables, checkpoints,
+policies, curve and videos. No network, loss or replay buffer is defined here.
 """
 
 import contextlib
 import copy
 import csv
 import ctypes
-import dataclasses
 import errno
-import functools
 import io
 import json
 import math
 import multiprocessing
 import os
 import pickle
+import re
+import shlex
 import signal
 import sys
+import tempfile
 import threading
 import time
+import traceback
 import zipfile
 from collections import deque
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent import futures
 from datetime import datetime
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
 import torch
 import torch.distributed as dist
+import tyro
+from gymnasium.vector.utils import CloudpickleWrapper
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic_core import ArgsKwargs
 from tqdm import tqdm
 
-CHECKPOINT_FORMAT = 1
-# Sets the seeds of evaluation episodes apart from those of training, whose second number counts environments.
+FILE_FORMAT = 2  # of checkpoints and policies
+# In an evaluation episode's seed this stands where training has the number of an environment.
 EVALUATION_KEY = 2**32 - 1
-# Workers are forked where that is safe: they start at once and share the memory of the imported libraries. They never
-# touch a GPU and run on one thread, the two things that do not survive a fork.
+# Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
+STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads"}
 
 
 class InputError(Exception):
-    """Something the user gave cannot be used. Its message is the one line that they see; the exit status is 2."""
+    """Something the user gave cannot be used. They see the message, one line; the exit status is 2."""
 
     exit_status = 2
 
 
 class RunError(Exception):
-    """Something failed while running (a full disk, a dead worker, a loss that is not finite). The exit status is 1."""
+    """Something failed while running: a full disk, a dead worker, a loss that is not finite. The exit status is 1."""
 
     exit_status = 1
 
 
-def require_range(config, least, most, *names):
-    """Raises InputError naming the first of these fields of `config` that is not finite and from `least` to `most`.
-
-    A field that holds several numbers needs it of each.
-    """
-    for name in names:
-        value = getattr(config, name)
-        numbers = value if isinstance(value, tuple) else (value,)
-        if not all(least <= number <= most and abs(number) < math.inf for number in numbers):
-            if most < math.inf:
-                allowed = f"from {least} to {most}"
-            else:
-                allowed = f"of {least} or more" if least > -math.inf else "that is finite"
-            raise InputError(f"--{name.replace('_', '-')} {value} cannot be used: it takes a number {allowed}")
-
-
-def require_batch(config, held_back=0):
-    """Raises InputError for a batch that the processes cannot share, or that the first random data do not fill.
-
-    Of these, every process has yet to store its last `held_back` steps.
-    """
-    processes = num_processes()
-    if config.batch_size % processes:
-        raise InputError(f"--batch-size {config.batch_size} cannot be shared by {processes} processes")
-    own = min(config.initial_collect_steps // processes - held_back, config.replay_buffer_capacity)
-    stored = max(0, processes * own)
-    if config.batch_size > stored:
-        raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
+class TaskError(Exception):
+    """The task's own code raised an exception, perhaps in a worker. The message is its traceback."""
 
 
 def run_main(main):
-    """Calls `main` and turns an `InputError` or a `RunError` into one line on stderr and an exit status."""
+    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+    # TensorBoard's thread would print a traceback about a full disk, which the main thread reports anyway.
+    hook = threading.excepthook
+    threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)
     try:
         main()
     except (InputError, RunError) as error:
         if int(os.environ.get("RANK", 0)) > 0:
-            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun then ends this one, and one line is printed
+            time.sleep(1)  # rank 0 mostly fails for the same reason, and torchrun then ends this one: one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        # Ranks that wait for each other in a collective would keep an orderly exit from ending.
-        sys.stdout.flush()
-        os._exit(error.exit_status) if dist.is_initialized() else sys.exit(error.exit_status)
+        # An orderly exit would wait for other ranks, or for workers that are gone.
+        if dist.is_initialized() or isinstance(error, RunError):
+            os._exit(error.exit_status)
+        sys.exit(error.exit_status)
     except KeyboardInterrupt:
         sys.exit(130)
 
 
-# Devices, randomness and memory
+def first_line(error):
+    """The first line of an error's message."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+# Configs and the command line
+
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
+
+
+def with_tutorial_values(given, tutorial):
+    """What `Config` is given, with the `tutorial`'s values for what is not given where `tutorial` is."""
+    values = given.kwargs or {} if isinstance(given, ArgsKwargs) else given
+    return tutorial | values if values.get("tutorial") else given
+
+
+def read_command_line(config_class, description, script):
+    """The config that the command line asks for. Its defaults are those of `config_class`, of the tutorial
+    (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
+    config = tyro.cli(config_class, description=description)
+    saved, given = {}, {"tutorial": config.tutorial}
+    if config.resume is not None:
+        saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
+    elif config.evaluate is not None:
+        saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
+    if saved and (others := vars(config).keys() ^ saved["config"].keys()):
+        raise InputError(f"{[*given.values()][0]} is of another version of this script, which differs in {min(others)}")
+    return tyro.cli(config_class, description=description, default=config_class(**saved.get("config", {}) | given))
+
+
+def plain_config(config):
+    """The config as a dict of numbers, strings and lists, without the paths of this very run."""
+    values = TypeAdapter(type(config)).dump_python(config, mode="json")
+    return values | {"run_dir": None, "resume": None, "evaluate": None}
+
+
+# Devices, memory and seeds
 
 
 def select_device(name, local_rank=0):
-    """The `torch.device` for `--device`; `auto` takes CUDA, then MPS, then the CPU, and rank i of a machine GPU i.
+    """The `torch.device` for --device: `auto` is CUDA or else the CPU, `cuda` is GPU number `local_rank`.
 
-    Raises InputError when the name is unknown or the device is not there.
+    Raises InputError for a name that is unknown or a device that is not there.
     """
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = None
-    if device is None or device.type not in ("cpu", "cuda", "mps") or (device.index and device.type != "cuda"):
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    match = re.fullmatch(r"cpu|mps|cuda(?::(\d+))?", name)
+    if not match:
         raise InputError(f"--device {name} is not a device: use auto, cpu, cuda, cuda:N or mps")
-    if device.type == "cuda":
-        index = local_rank if device.index is None else device.index
-        if index >= torch.cuda.device_count():
-            raise InputError(f"--device {name}: CUDA GPU {index} is not there ({torch.cuda.device_count()} found)")
-        device = torch.device("cuda", index)
-    if device.type == "mps" and not torch.backends.mps.is_available():
-        raise InputError("--device mps: there is no MPS device here; use auto or cpu")
+    device = torch.device("cuda", int(match[1] or local_rank)) if name.startswith("cuda") else torch.device(name)
+    gpus = torch.cuda.device_count()
+    if name == "mps" and not torch.backends.mps.is_available() or device.type == "cuda" and device.index >= gpus:
+        raise InputError(f"--device {name} is not there (CUDA GPUs found: {gpus}): use auto or cpu")
     return device
 
 
 def keep_freed_memory():
     """Tells glibc to keep what is freed (mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, 256 MB).
 
-    A training step allocates and frees the same few hundred kilobytes over and over. By default every such tensor is
-    mapped in afresh from the system, page fault by page fault. Elsewhere than on glibc this does nothing.
+    Every update frees and allocates the same tensors. Without this each would be mapped in afresh, page by page.
     """
-    with contextlib.suppress(OSError, AttributeError, TypeError):
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # no glibc
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 256 << 20)
         libc.mallopt(-1, 256 << 20)
 
 
 def empty_replay(capacity, columns, device):
-    """An uninitialized float32 tensor (capacity, columns). Raises InputError when the device has not that much memory."""
+    """An uninitialized float32 tensor (capacity, columns). Raises InputError when there is not that much memory."""
     try:
         return torch.empty(capacity, columns, device=device)
     except (RuntimeError, TypeError):  # the latter for a number beyond 64 bits
@@ -146,84 +165,48 @@ def empty_replay(capacity, columns, device):
         raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
 
 
-def random_state():
-    """The state of torch's generators, CPU and current GPU: a dict of byte tensors."""
-    return {"cpu": torch.get_rng_state()} | ({"cuda": torch.cuda.get_rng_state()} if torch.cuda.is_initialized() else {})
-
-
-def set_random_state(state):
-    """Puts back what `random_state` returned."""
-    torch.set_rng_state(state["cpu"])
-    if "cuda" in state and torch.cuda.is_available():
-        torch.cuda.set_rng_state(state["cuda"])
-
-
 def episode_seed(*key):
-    """A 32-bit seed for one episode from a tuple of integers such as (seed, env index, episode number)."""
+    """A 32-bit seed for one episode from integers such as (seed, env index, episode number)."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
-# Several processes training together
+# Several processes that train one agent
 
 
-def num_processes():
-    """How many processes torchrun started, this one among them; 1 without torchrun."""
-    return int(os.environ.get("WORLD_SIZE", 1)) if "RANK" in os.environ else 1
-
-
-class _Mean(torch.autograd.Function):
-    """The mean over the ranks. What it passes back is the same mean, of the ranks' gradients."""
-
-    @staticmethod
-    def forward(ctx, tensor):
-        dist.all_reduce(tensor := tensor.clone())
-        return tensor / dist.get_world_size()
-
-    backward = forward
-
-
-@dataclasses.dataclass(frozen=True)
 class Ranks:
-    """This process among those that `torchrun` started; a single process is rank 0 of 1 and talks to nobody."""
+    """This process among those that torchrun started. Without torchrun it is rank 0 of 1 and talks to nobody."""
 
-    rank: int = 0
-    world_size: int = 1
-    local_rank: int = 0
+    def __init__(self, rank=0, world_size=1):
+        self.rank, self.world_size = rank, world_size
 
     @classmethod
     def join(cls):
-        """Joins the process group that torchrun's environment variables describe."""
-        if num_processes() == 1:
+        """Joins the processes that torchrun's environment variables describe. Raises InputError when one is missing."""
+        if "RANK" not in os.environ or os.environ.get("WORLD_SIZE") == "1":
             return cls()
+        if missing := {"WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"} - os.environ.keys():
+            raise InputError(f"RANK is set but {min(missing)} is not: start processes with torchrun, or unset RANK")
         if not dist.is_initialized():
             dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        return cls(dist.get_rank(), dist.get_world_size(), int(os.environ.get("LOCAL_RANK", 0)))
+        return cls(dist.get_rank(), dist.get_world_size())
 
-    def average_gradients(self, parameters):
-        """Replaces every gradient by its mean over the ranks, in one collective.
+    def batch_share(self, config, held_back=0):
+        """The size of this process's share of a batch. Raises InputError when the shares are not equal, or when the
+        initial steps, less the last `held_back` of each process, do not fill the batch."""
+        if config.batch_size % self.world_size:
+            raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
+        own = min(config.initial_collect_steps // self.world_size - held_back, config.replay_buffer_capacity)
+        if config.batch_size > (stored := max(0, own * self.world_size)):
+            raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
+        return config.batch_size // self.world_size
 
-        The mean over the ranks of the mean over batch/N is the mean over the batch.
-        """
-        if self.world_size == 1:
-            return
-        gradients = [parameter.grad for parameter in parameters]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
-        dist.all_reduce(flat)
-        flat /= self.world_size
-        for gradient, mean in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
-            gradient.copy_(mean.view_as(gradient))
-
-    def mean(self, tensor):
-        """The mean over the ranks of a tensor, the same on each. Gradients flow to all of them."""
-        return _Mean.apply(tensor) if self.world_size > 1 else tensor
-
-    def any(self, flag):
-        """Whether `flag` is true on any rank."""
-        if self.world_size == 1:
-            return flag
-        flags = torch.tensor(float(flag))
-        dist.all_reduce(flags, dist.ReduceOp.MAX)
-        return bool(flags)
+    def average(self, tensors):
+        """Replaces each tensor by its mean over the ranks, in one collective for all of them."""
+        if self.world_size > 1:
+            dist.all_reduce(flat := torch.cat([tensor.flatten() for tensor in tensors]))
+            means = (flat / self.world_size).split([tensor.numel() for tensor in tensors])
+            for tensor, mean in zip(tensors, means):
+                tensor.copy_(mean.view_as(tensor))
 
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
@@ -233,746 +216,587 @@ class Ranks:
         dist.gather_object(value, values)
         return values
 
-    def broadcast(self, value):
-        """Rank 0's value, on every rank."""
-        if self.world_size > 1:
-            values = [value]
-            dist.broadcast_object_list(values)
-            return values[0]
-        return value
+
+# Tasks and their worker processes
 
 
-# Environments and worker processes
+def find_task(config, action_space):
+    """The gymnasium spec of --env-id with a time limit, and its observation and action spaces.
 
-
-def die_with_parent():
-    """For a worker process: leaves Ctrl-C and SIGTERM, which a whole group is often sent, to the main process.
-
-    It exits as soon as that process is gone.
+    Worker processes make the task from the spec: there it may not be registered. Raises InputError when it is unknown
+    or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
     """
-    if multiprocessing.parent_process() is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        threading.Thread(
-            target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True
-        ).start()
+    name = f"--env-id {config.env_id}"
+    if config.env_id.count(":") > 1 or config.env_id.startswith("."):
+        raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
+    try:
+        with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
+            task, observations, actions = env.spec, env.observation_space, env.action_space
+    except (gym.error.Error, ImportError) as error:
+        raise InputError(f"{name} cannot be made: {first_line(error)}") from None
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
+        raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
+    if action_space is gym.spaces.Discrete:
+        fits, needed = isinstance(actions, gym.spaces.Discrete) and actions.start == 0, "Discrete from 0"
+    else:
+        fits, needed = isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f", "bounded Box"
+        with np.errstate(all="ignore"):
+            width = np.subtract(actions.high, actions.low, dtype=np.float32) if fits else np.zeros(1)
+        fits = (np.isfinite(width) & (width > 0)).all()
+    if not fits:
+        raise InputError(f"{name} has the action space {actions}: this algorithm needs a {needed}")
+    task.max_episode_steps = task.max_episode_steps or 10_000  # or an evaluation might never end
+    return task, observations, actions
+
+
+@contextlib.contextmanager
+def telling_task_errors():
+    """Turns an exception of the task into a `TaskError`, which, unlike others, always comes through a pipe whole."""
+    try:
+        yield
+    except RunError:
+        raise
+    except Exception:
+        raise TaskError(f"the task failed\n{traceback.format_exc()}") from None
+
+
+def start_worker():
+    """In a worker process: leaves to the main process the signals that a whole group is sent, and ends with it."""
+    torch.set_num_threads(1)
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
 class SeededEpisodes(gym.Wrapper):
-    """Seeds every episode by (seed, env index, episode number) and can start in the middle of one.
+    """Seeds every episode by (seed, env index, episode number) and can begin in the middle of one.
 
-    No simulator saves all its caches in mid-episode, but an episode is a function of its seed and its actions: played
-    again from the reset, it comes to the same state to the last bit. `actions` are those to play at the first reset.
+    No simulator can be saved in mid-episode. But an episode follows from its seed and its actions: played again from
+    the reset, it comes to the same state to the last bit. Copies are kept: a task may change an array it was given or
+    has returned.
     """
 
-    def __init__(self, env, seed, index, episode=0, actions=()):
+    def __init__(self, env, key, episode=0, actions=(), total=0.0):
         super().__init__(env)
-        self.key, self.episode, self.actions = (seed, index), episode, actions
-
-    def reset(self, *, seed=None, options=None):
-        observation, info = self.env.reset(seed=episode_seed(*self.key, self.episode), options=options)
-        self.episode += 1
-        for action in self.actions:
-            observation, *_ = self.env.step(action)
-        self.actions = ()
-        return observation, info
-
-
-class Episodes:
-    """Where the running episode of each of K environments stands, and how the last 10 to end did.
-
-    `number[i]` counts the episodes of environment i that have ended.
-    """
-
-    def __init__(self, num_envs, seed, first_index=0, state=None):
-        self.seed, self.first_index = seed, first_index
-        self.number = [0] * num_envs
-        self.actions = [[] for _ in range(num_envs)]
-        self.returns = [0.0] * num_envs
-        self.finished = deque(maxlen=10)
-        if state:
-            self.number, self.returns = list(state["number"]), list(state["returns"])
-            self.actions = [list(actions.numpy()) for actions in state["actions"]]
-            self.finished.extend(state["finished"])
-
-    @contextlib.contextmanager
-    def open_envs(self, make_env, in_workers):
-        """The K environments as one vector env, each to be brought to where its episode stands by `reset()`.
-
-        An episode that ends is reset within the step, its true last observation in `infos["final_obs"]`. With
-        `in_workers` each environment has a process of its own, so that `step_async` returns at once.
-        """
-
-        def make(i):
-            die_with_parent()
-            return SeededEpisodes(make_env(), self.seed, self.first_index + i, self.number[i], self.actions[i])
-
-        makers = [functools.partial(make, i) for i in range(len(self.number))]
-        mode = gym.vector.AutoresetMode.SAME_STEP
-        if not in_workers:
-            yield gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
-            return
-        envs = gym.vector.AsyncVectorEnv(makers, autoreset_mode=mode, context=START_METHOD)
-        try:
-            yield envs
-        finally:
-            for process in envs.processes:
-                process.kill()  # between two steps or within one, there is nothing in a worker to save
-            envs.closed = True
-
-    def record(self, actions, rewards, done):
-        """Notes one step of every environment: actions (K, …), rewards (K,), done (K,)."""
-        for i, (action, reward) in enumerate(zip(actions, rewards)):
-            self.actions[i].append(action)
-            self.returns[i] += float(reward)
-            if done[i]:
-                self.finished.append((self.returns[i], len(self.actions[i])))
-                self.number[i] += 1
-                self.actions[i], self.returns[i] = [], 0.0
+        self.key, self.episode, self.actions, self.total = key, episode, list(actions), total
 
     def state(self):
-        """Everything needed to come back to this point, for a checkpoint."""
-        actions = [torch.from_numpy(np.array(actions)) for actions in self.actions]
-        return {"number": self.number, "actions": actions, "returns": self.returns, "finished": list(self.finished)}
+        return self.episode, self.actions, self.total
+
+    def reset(self, **_):
+        replay, self.actions, self.total = self.actions, [], 0.0
+        with telling_task_errors():
+            observation, _ = self.env.reset(seed=episode_seed(*self.key, self.episode))
+        for action in replay:
+            observation, _, terminated, truncated, _ = self.step(action)
+            if terminated or truncated:
+                return self.reset()[0], {"not_repeatable": True}
+        return np.array(observation), {}
+
+    def step(self, action):
+        with telling_task_errors():
+            observation, reward, terminated, truncated, _ = self.env.step(copy.copy(action))
+        self.actions.append(np.array(action))
+        self.total += float(reward)
+        info = {}
+        if terminated or truncated:
+            info = {"return": self.total, "length": len(self.actions)}
+            self.episode, self.actions = self.episode + 1, []
+        return np.array(observation), float(reward), bool(terminated), bool(truncated), info
+
+
+class Environments:
+    """K environments of one task, stepped together; `observations` (K, …) are those to act on.
+
+    `num_episodes` (K,) counts the episodes that have ended in each.
+    """
+
+    def __init__(self, make_env, run, in_workers):
+        """With `in_workers` each has a process of its own, so that `step_async` returns at once."""
+        seed, num_envs, rank, main = run.config.seed, run.config.num_envs, run.ranks.rank, os.getpid()
+        saved = {"episodes": [(0, [], 0.0)] * num_envs, "finished": []}
+        if run.checkpoint:
+            saved = run.checkpoint["ranks"][rank]["environments"]
+        self.in_workers, self.num_episodes = in_workers, np.array([number for number, *_ in saved["episodes"]])
+        self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
+
+        def make(i, episode, actions, total):
+            if os.getpid() != main:
+                start_worker()
+            return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, map(np.array, actions), total)
+
+        makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
+        kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
+        self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
+        run.stack.callback(self.close)
+        self.observation_size = math.prod(self.vector.single_observation_space.shape)
+
+    def reset(self):
+        """Brings each to where its episode stands. Returns whether all episodes could be played again."""
+        self.observations, infos = self.vector.reset()
+        self.num_episodes += infos.get("_not_repeatable", np.array(False))
+        return "not_repeatable" not in infos
+
+    def step_async(self, actions):
+        """Starts a step with actions (K, …)."""
+        self.actions = actions
+        if self.in_workers:
+            self.vector.step_async(actions)
+
+    def step_wait(self):
+        """The transitions of that step: observations (K, …), actions (K, …), rewards (K,), terminated (K,), truncated
+        (K,), next observations (K, …). The last are the true ones where an episode has ended and was reset."""
+        step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
+        next_observations, rewards, terminated, truncated, infos = step
+        observations, self.observations = self.observations, next_observations.copy()
+        for i in np.flatnonzero(terminated | truncated):
+            next_observations[i] = infos["final_obs"][i]
+            self.finished.append((float(infos["final_info"]["return"][i]), int(infos["final_info"]["length"][i])))
+        self.num_episodes += terminated | truncated
+        return observations, self.actions, rewards, terminated, truncated, next_observations
 
     def recent(self):
         """The mean return and length of the last 10 episodes that ended (nan before the first)."""
         returns, lengths = zip(*self.finished) if self.finished else ([math.nan], [math.nan])
         return {"collect_return": float(np.mean(returns)), "collect_episode_length": float(np.mean(lengths))}
 
-
-def last_observations(next_observations, infos):
-    """`next_observations` (K, …) with the true last observation where an episode has ended and was reset."""
-    if "final_obs" not in infos:
-        return next_observations
-    last = next_observations.copy()
-    for i in infos["_final_obs"].nonzero()[0]:
-        last[i] = infos["final_obs"][i]
-    return last
-
-
-class Evaluations:
-    """Evaluations in a pool of worker processes beside training, each reported under the step whose weights it used.
-
-    `evaluate(policy, env_id, seed) -> (return, length)` plays one episode; it and the policy must be picklable. Every
-    evaluation plays the same `seeds`, of which each rank takes its share. They are reported in the order they were
-    started, and what is still running is in `state()`, so that a checkpoint loses none.
-    """
-
-    def __init__(self, evaluate, env_id, seeds, ranks):
-        self.evaluate, self.env_id, self.seeds, self.ranks = evaluate, env_id, seeds, ranks
-        self.pending = deque()
-        # The cores that this process may use: on a cluster's node they are not all of them.
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        self.pool = ProcessPoolExecutor(
-            min(cores, math.ceil(len(seeds) / ranks.world_size)),
-            multiprocessing.get_context(START_METHOD),
-            initializer=_start_pool_worker,
-        )
-        # The first call forks the workers: now, before anything has used a GPU or started threads.
-        self.pool.submit(int).result()
-        for worker in self.pool._processes.values():
-            worker.terminate = worker.kill  # when one has died the pool ends the others, which ignore SIGTERM
-
-    def start(self, header, policy):
-        """Starts evaluating a copy of `policy` (None: random actions), to be reported with `header`, a dict."""
-        policy = policy and copy_to_cpu(policy)
-        share = self.seeds[self.ranks.rank :: self.ranks.world_size]
-        futures = [self.submit(self.evaluate, policy, self.env_id, seed) for seed in share]
-        self.pending.append((header, policy, futures))
-
-    def submit(self, function, policy, *args):
-        """A future of `function(policy, *args)` in a worker, for a policy on the CPU or None."""
-        # Pickled here, by value: the pool's queue would send tensors as handles of shared memory.
-        return self.pool.submit(_call_with_policy, function, pickle.dumps(policy), *args)
-
-    def finished(self):
-        """Yields (header, policy, returns, lengths) of those that are done.
-
-        Returns and lengths are rank 0's; elsewhere they are None. Raises BrokenProcessPool when a worker died.
-        """
-        while self.pending:
-            header, policy, futures = self.pending[0]
-            if self.ranks.any(not all(future.done() for future in futures)):
-                return
-            gathered = self.ranks.gather([future.result() for future in futures])
-            self.pending.popleft()
-            if gathered is None:
-                yield header, policy, None, None
-            else:
-                episodes = [gathered[i % len(gathered)][i // len(gathered)] for i in range(len(self.seeds))]
-                yield header, policy, *map(list, zip(*episodes))
-
-    def state(self):
-        """The evaluations still running, as (header, policy weights) pairs for a checkpoint."""
-        return [(header, policy and policy.state_dict()) for header, policy, _ in self.pending]
+    def state_dict(self):
+        episodes = [(n, torch.from_numpy(np.array(actions)), total) for n, actions, total in self.vector.call("state")]
+        return {"episodes": episodes, "finished": list(self.finished)}
 
     def close(self):
-        """Ends the workers without waiting for what they still do."""
-        for worker in self.pool._processes.values():
-            worker.kill()
-        # Python 3.10 would wait for ever for the dead to read what was being sent to them.
-        self.pool._call_queue._reader.close()
-        self.pool.shutdown(cancel_futures=True)
+        for process in getattr(self.vector, "processes", []):
+            process.kill()  # there is nothing in a worker to save
+            self.vector.closed = True
+        self.vector.close()
 
 
-def _start_pool_worker():
-    die_with_parent()
-    torch.set_num_threads(1)
-    if hasattr(os, "nice"):
-        os.nice(5)  # training waits for its own physics, nothing waits for an evaluation
-
-
-def _call_with_policy(function, policy, *args):
-    return function(pickle.loads(policy), *args)
-
-
-def copy_to_cpu(module):
-    """A copy of a module that shares nothing with it."""
-    return copy.deepcopy(module).cpu()
-
-
-class StopRequest:
-    """Turns the first Ctrl-C or SIGTERM into a flag that the training loop looks at; a second Ctrl-C ends at once."""
-
-    def __init__(self):
-        self.requested = False
-
-    def __enter__(self):
-        self.previous = {}
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self.previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_):
-        for number, handler in self.previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number, _):
-        if self.requested and number == signal.SIGINT:
-            os._exit(130)  # the workers notice and follow
-        self.requested = True
-        os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
-
-
-# The run directory
-
-
-@contextlib.contextmanager
-def replacing(path):
-    """Gives the name of a temporary file, renamed to `path` at the end; an error removes it and leaves `path` alone."""
-    path = Path(path)
-    temporary = path.with_name(f".tmp-{path.name}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)  # what an error has left
+# Files
 
 
 def write_atomically(path, write):
     """Lets `write(file)` fill a temporary file, then renames it to `path`: a kill leaves the old file or the new one.
 
-    Raises RunError, leaving the old file whole, when the disk is full or not writable.
+    Raises OSError, leaving the old file whole, when the disk is full or not writable.
     """
+    temporary = path.with_name(f".tmp-{path.name}")
     try:
-        with replacing(path) as temporary, open(temporary, "wb") as file:
+        with open(temporary, "wb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-    except (OSError, RuntimeError) as error:  # torch.save reports a failed write as a RuntimeError
-        raise RunError(f"cannot write {path} ({_reason(error)}); the last good checkpoint is kept") from error
+        os.replace(temporary, path)
+    except RuntimeError as error:  # torch.save's own after an OSError
+        raise error.__context__ or error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
-def _reason(error):
-    while error.__context__ is not None and not isinstance(error, OSError):
-        error = error.__context__
-    return getattr(error, "strerror", None) or first_line(error)
+def read_file(path, kind, script):
+    """Reads a "checkpoint" or "policy" that a `Run` of this script wrote, onto the CPU. Nothing in it is executed.
+
+    Raises InputError when it is missing, damaged or foreign.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():  # torch.load does not look at the checksums
+                raise ValueError(f"{damaged} is damaged")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        found = state["kind"], state["script"], state["format"]
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist: --resume takes a run's directory, --evaluate its policy.pt") from None
+    except Exception as error:  # whatever a damaged or hostile file provokes
+        raise InputError(f"{path} is not a whole {kind} of this project ({first_line(error)})") from None
+    if found != (kind, script, FILE_FORMAT):
+        found = f"a {found[0]} of {found[1]}, format {found[2]}"
+        raise InputError(f"{path} is {found}; needed: a {kind} of {script}, format {FILE_FORMAT}")
+    return state
+
+
+def export_policy(path, policy, observation_shape):
+    """Writes `policy`, for any batch size, so that `torch.export.load(path).module()` needs none of our code."""
+    batch = torch.zeros((2, *observation_shape))
+    program = torch.export.export(policy, (batch,), dynamic_shapes=({0: torch.export.Dim("batch")},))
+    torch.export.save(program, archive := io.BytesIO())  # into a file on a full disk it would end the process
+    write_atomically(path, lambda file: file.write(archive.getvalue()))
+
+
+# Runs
+
+
+_task = None  # a worker's
+
+
+def _start_evaluator(task):
+    global _task
+    _task = task.fn
+    start_worker()
+
+
+def _in_worker(function, policy_file, *arguments):
+    with telling_task_errors():
+        return function(pickle.loads(policy_file.read_bytes()), _task, *arguments)
 
 
 class Run:
-    """One training run: its processes, device, files and evaluations, and the checkpoint that it continues from.
+    """One training run: its processes, device, directory and evaluations, and the checkpoint that it continues from.
 
-    The directory holds `config.json`, a CSV per table of metrics (`train`, `eval`, `random`), TensorBoard's events,
-    the checkpoint, the policies, the curve and the videos. The rows are kept in memory too and go into the checkpoint:
-    on resume the files are written anew from them, so what the interrupted run wrote after its checkpoint is replaced.
-    Only rank 0 writes and prints.
+    The directory holds `config.json`, a CSV for each table of metrics (`train`, `eval`, `random`), TensorBoard's events,
+    the checkpoint, the policies, the curve and the videos. A checkpoint has the tables too: on resume the files are
+    written anew from it. Rank 0 alone evaluates, writes and prints.
     """
 
-    def __init__(self, config, script, evaluate):
-        self.config, self.script = config, script
-        self.ranks = Ranks.join()
+    def __init__(self, config, script, task, evaluate):
+        """`evaluate(policy, task, seed)` plays one episode in a worker process and returns its return and length."""
+        if multiprocessing.current_process().daemon:
+            raise InputError("a process of a multiprocessing.Pool cannot train: use multiprocessing.Process")
+        self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
+        self.ranks, self.checkpoint = Ranks.join(), {}
         self.writes = self.ranks.rank == 0
+        self.device = select_device(config.device, int(os.environ.get("LOCAL_RANK", 0)))
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
-        self.device = select_device(config.device, self.ranks.local_rank)
         if config.resume is not None:
-            self.path = Path(config.resume)
-            shared, own = load_checkpoint(self.path / "checkpoint.pt", script, self.ranks)
-            self.checkpoint = shared | own
-            require_same_run(config, shared["config"])
-        else:
-            # To the microsecond, for runs that are started at once.
-            default = Path("runs") / f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
-            self.path = Path(self.ranks.broadcast(config.run_dir or default))
-            self.checkpoint = {}
-            if self.writes:
-                self._make_directory()
-        self.tables = self.checkpoint.get("tables", {})
-        self.best_return = self.checkpoint.get("best_return", -math.inf)
-        self.best_weights = self.checkpoint.get("best_weights")
+            self.checkpoint = read_file(config.resume / "checkpoint.pt", "checkpoint", script)
+            self._require_same_run(self.checkpoint["config"])
+        # To the microsecond, for runs that are started at once.
+        name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
+        self.path = config.resume or config.run_dir or Path("runs") / name
+        self.tables = self.checkpoint.get("tables", {"train": [], "eval": [], "random": []})
+        self.best = self.checkpoint.get("best", {"return": -math.inf, "weights": None})
         self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
-        self.last_logged = (time.monotonic(), self.checkpoint.get("step", 0))
-        self.summary_writer = None
-        # The workers are forked here, before anything has used a GPU.
-        seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
-        self.evaluations = Evaluations(evaluate, config.env_id, seeds, self.ranks)
-        self.stop = StopRequest()
+        self.saved_step = self.checkpoint.get("step", 0)
+        self.last_logged = time.monotonic(), self.saved_step
+        self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
         self.stack = contextlib.ExitStack()
-        keep_freed_memory()
-        torch.set_num_threads(config.num_threads)
+
+    def _require_same_run(self, saved):
+        config = plain_config(self.config) | {"run_dir": self.config.run_dir}
+        changed = [n for n in config if config[n] != saved[n] and n not in MAY_DIFFER_ON_RESUME]
+        if config["num_iterations"] < saved["num_iterations"]:
+            changed.append("num_iterations")
+        for name in changed:
+            flag = f"--{name.replace('_', '-')} {config[name]}"
+            raise InputError(f"{flag}: the run to resume has {saved[name]}. It cannot change (--num-iterations may grow)")
+        if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
+            raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
 
     def __enter__(self):
-        if self.device.type == "cuda":
-            torch.cuda.set_device(self.device)
-        self.stack.callback(self.evaluations.close)
-        self.enter(self.stop)
-        self.progress = self.enter(
-            tqdm(
-                total=self.config.num_iterations,
-                initial=self.checkpoint.get("step", 0),
-                unit="step",
-                disable=not (self.writes and sys.stderr.isatty()),
-            )
-        )
+        if threading.current_thread() is threading.main_thread():
+            for number in STOP_SIGNALS:
+                self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
+        if self.writes:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+            workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+            self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
+            task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
+            self.pool = futures.ProcessPoolExecutor(workers, context, _start_evaluator, (task,))
+            self.stack.callback(self.pool.shutdown)
+            self.pool.submit(int).result()  # starts the workers: now, before anything uses a GPU or starts threads
+            for worker in set(multiprocessing.active_children()).difference(others):
+                self.stack.callback(worker.kill)
+        keep_freed_memory()
+        torch.set_num_threads(self.config.num_threads)
         return self
-
-    def enter(self, context):
-        """Enters a context that ends with the run."""
-        return self.stack.enter_context(context)
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
-        if isinstance(error, (EOFError, ConnectionError, BrokenProcessPool)):
-            raise RunError(f"a worker process died; --resume {self.path} continues from the last checkpoint") from error
-        if isinstance(error, RuntimeError) and self.ranks.world_size > 1 and "gloo" in str(error):
-            raise RunError(f"lost another process of this run ({first_line(error)})") from error
+        died = isinstance(error, (EOFError, ConnectionError, futures.BrokenExecutor))
+        lost = self.ranks.world_size > 1 and (isinstance(error, dist.DistError) or "gloo" in str(error))
+        if died or lost or isinstance(error, OSError):
+            reason = "a worker process died" if died else "lost another process: " * lost + first_line(error)
+            raise RunError(f"{reason}; {self._how_to_continue()}") from error
 
-    def _make_directory(self):
+    def _how_to_continue(self):
+        if not (self.path / "checkpoint.pt").exists():
+            return "there is no checkpoint yet"
+        python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
+        program = Path(sys.modules[type(self.config).__module__].__file__).name
+        return f"to continue from the last checkpoint: {python} {program} --resume {shlex.quote(str(self.path))}"
+
+    def _request_stop(self, number, _):
+        if self.stopping and number == signal.SIGINT:
+            os._exit(130)  # the workers notice and follow
+        self.stopping = True
+        with contextlib.suppress(OSError):
+            os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
+
+    def stop_requested(self, step):
+        """Whether any rank was asked to stop. Several processes exchange messages for it, so not at every step."""
+        if self.ranks.world_size == 1 or step % 20 == 0 or step % self.config.eval_interval == 0:
+            self.ranks.average([stopping := torch.tensor(float(self.stopping))])
+            self.stopped = bool(stopping > 0)
+        return self.stopped
+
+    def start(self, agent, buffer, environments):
+        """Restores the checkpoint, if any, begins the files, and says what is trained, on what, and where.
+
+        Returns the gradient updates and the environment steps done so far. There is no directory before this, when all
+        that the user gave has been found usable.
+        """
+        config, saved, self.checkpoint = self.config, self.checkpoint, {}
+        if saved:
+            own = saved["ranks"][self.ranks.rank]
+            agent.load_state_dict(saved["agent"])
+            for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
+                optimizer.load_state_dict(state)
+            buffer.load_state_dict(own["buffer"])
+            torch.set_rng_state(own["random"]["cpu"])
+            if self.device.type == "cuda" and "cuda" in own["random"]:
+                torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
+        repeated = environments.reset()
+        if self.writes:
+            self._start_files()
+        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
+        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
+        self.stack.callback(self.progress.close)
+        processes = f", process 0 of {self.ranks.world_size}" if self.ranks.world_size > 1 else ""
+        self.print(f"{config.env_id}, at most {self.task.max_episode_steps} steps an episode (--max-episode-steps)")
+        self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
+        self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full; run directory {self.path}")
+        if not repeated:
+            self.print("warning: an episode went differently when it was played again: this resume is not exact")
+        return self.saved_step, saved.get("env_steps", 0)
+
+    def _start_files(self):
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            used = any(self.path.iterdir())
+            if self.config.resume is None:
+                if any(self.path.iterdir()):
+                    raise FileExistsError(0, "not empty: name a new one, or continue it with --resume")
+                (self.path / "config.json").touch(exist_ok=False)  # fails for the second of two runs started at once
         except OSError as error:
             raise InputError(f"--run-dir {self.path} cannot be used: {error.strerror}") from None
-        if used:
-            raise InputError(f"--run-dir {self.path} is not empty: name a new one, or continue it with --resume")
-
-    def _save_config(self):
-        config = dataclasses.replace(self.config, run_dir=str(self.path), resume=None)
-        text = json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+        text = json.dumps(plain_config(self.config), indent=2) + "\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
-
-    def _rewrite_tables(self):
-        later = [self.path / f"{name}.csv" for name in ("train", "eval", "random") if name not in self.tables]
-        for path in [*later, *self.path.glob("events.out.tfevents.*")]:
+        for path in [*self.path.glob("events.out.tfevents.*"), *(self.path / f"{table}.csv" for table in self.tables)]:
             path.unlink(missing_ok=True)
-        for name, rows in self.tables.items():
-            text = "".join(map(_csv_line, [rows[0].keys(), *(row.values() for row in rows)]))
-            write_atomically(self.path / f"{name}.csv", lambda file, text=text: file.write(text.encode()))
+        from torch.utils.tensorboard import SummaryWriter  # takes a second
+
+        self.summary_writer = SummaryWriter(self.path)
+        self.stack.push(lambda kind, *_: kind is not None and issubclass(kind, OSError))  # the same full disk again
+        self.stack.callback(self.summary_writer.close)
+        for table, rows in self.tables.items():
             for row in rows:
-                self._write_summary(name, row)
-
-    def start(self, observation_space, action_space, buffer_bytes):
-        """Begins the files anew, with what the checkpoint has of them, and says what is trained, on what, and where.
-
-        Called when all that the user gave has been found usable: until then a new directory is left empty.
-        """
-        if self.writes:
-            self._rewrite_tables()
-            self._save_config()
-        config = self.config
-        processes = f", process 0 of {self.ranks.world_size}" if self.ranks.world_size > 1 else ""
-        with np.printoptions(precision=2, threshold=8, edgeitems=2):
-            self.print(f"task {config.env_id}: observations {observation_space}, actions {action_space}")
-        self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
-        self.print(f"replay buffer of {buffer_bytes / 1e6:.0f} MB when full; run directory {self.path}")
+                self._write_summary(table, row)
+            self._write_table(table)
+        if self.best["weights"]:  # the file may be of an evaluation that came after the checkpoint
+            self._save("best_policy.pt", "policy", {"weights": self.best["weights"]})
 
     def print(self, line):
-        """Prints a line, above the progress bar where there is one. Stops the run when nobody reads on (`| head`)."""
-        if not self.writes:
-            return
+        """Prints a line, above the progress bar. A run whose output nobody reads any more goes on."""
         try:
-            tqdm.write(line)
-            sys.stdout.flush()
+            if self.writes and sys.stdout is not None:
+                tqdm.write(line)
+                sys.stdout.flush()
+        except ValueError:
+            pass  # the stream is closed
         except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            if not isinstance(error, BrokenPipeError):
-                raise RunError(f"cannot print ({error.strerror}); the last good checkpoint is kept") from error
-            self.stop.requested = True
+            if error.errno == errno.ENOSPC:
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would complain at its end
 
-    def log(self, table, row):
-        """Appends a row, a dict that starts with `step`, to a table: to its CSV and to TensorBoard."""
-        if not self.writes:
-            return
-        rows = self.tables.setdefault(table, [])
-        lines = _csv_line(row.values()) if rows else _csv_line(row.keys()) + _csv_line(row.values())
-        rows.append(row)
-        try:
-            append_whole(self.path / f"{table}.csv", lines.encode())
-            self._write_summary(table, row)
-        except OSError as error:
-            raise RunError(f"cannot write to {self.path} ({error.strerror}); the last good checkpoint is kept") from error
+    def _log(self, table, step, env_steps, values):
+        seconds = round(time.monotonic() - self.started, 3)
+        self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
+        self._write_summary(table, self.tables[table][-1])
+        self._write_table(table)
+
+    def _write_table(self, table):
+        if rows := self.tables[table]:
+            writer = csv.DictWriter(text := io.StringIO(), rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+            write_atomically(self.path / f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
 
     def _write_summary(self, table, row):
-        if self.summary_writer is None:
-            self.summary_writer = self.enter(_tensorboard(self.path))
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
 
-    def header(self, step, env_steps):
-        """The columns that every row starts with."""
-        return {"step": step, "env_steps": env_steps, "seconds": round(time.monotonic() - self.started, 3)}
+    def log_training(self, step, env_steps, environments, metrics):
+        """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
 
-    def log_training(self, step, env_steps, episodes, metrics):
-        """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row."""
+        Raises RunError naming the step and the first of the metrics that is not finite.
+        """
+        if not self.writes:
+            return
+        values = dict(zip(metrics, torch.stack(list(metrics.values())).tolist()))  # one wait for a GPU
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
         now, (then, last_step) = time.monotonic(), self.last_logged
-        self.last_logged = now, step
-        speed = (step - last_step) / (now - then)
-        values = {name: float(value) for name, value in metrics.items()}
-        self.log("train", self.header(step, env_steps) | {"steps_per_second": speed} | episodes.recent() | values)
+        self.last_logged, speed = (now, step), (step - last_step) / (now - then)
+        self._log("train", step, env_steps, {"steps_per_second": speed} | environments.recent() | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
         self.print(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
-    def start_evaluation(self, step, env_steps, policy):
-        """Evaluates `policy` (None: random actions) beside training, to be reported under this step."""
-        self.evaluations.start(self.header(step, env_steps), policy)
+    def evaluate(self, step, env_steps, policy):
+        """Plays the evaluation episodes with `policy` (None: random actions) and logs how they went, once for each step.
 
-    def restart_evaluations(self, policy, policy_file):
-        """Starts the evaluations again that were under way at the checkpoint; `policy` is lent for their weights.
-
-        The best policy is written again too: the file's may be of an evaluation that came after the checkpoint.
+        The best policy so far is saved. A stop request ends this early; the resumed run does it again.
         """
-        policy = copy_to_cpu(policy)
-        if self.best_weights is not None and self.writes:
-            policy.load_state_dict(self.best_weights)
-            policy_file.save(self.path / "best_policy.pt2", policy)
-        for header, weights in self.checkpoint["evaluations"]:
-            if weights is not None:
-                policy.load_state_dict(weights)
-            self.evaluations.start(header, policy if weights is not None else None)
+        table = "eval" if policy else "random"
+        if not self.writes or any(row["step"] == step for row in self.tables[table][-1:]):
+            return
+        policy = policy and copy.deepcopy(policy).cpu()
+        episodes = self._in_pool(self.evaluate_episode, policy, [(seed,) for seed in evaluation_seeds(self.config)])
+        while futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION).not_done and not self.stopping:
+            if any(episode.done() and episode.exception() for episode in episodes):
+                break
+        if self.stopping:
+            return [episode.cancel() for episode in episodes]
+        row, text = summarize([episode.result() for episode in episodes])
+        self._log(table, step, env_steps, row)
+        self.print(f"{f'step = {step}' if policy else 'random policy'}: {text}")
+        if policy:
+            self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
+            if row["average_return"] > self.best["return"]:
+                self.best = {"return": row["average_return"], "weights": policy.state_dict()}
+                self._save("best_policy.pt", "policy", {"weights": self.best["weights"]})
 
-    def report_evaluations(self, policy_file):
-        """Logs the evaluations that are done; the policy of the best so far is saved with `policy_file`."""
-        for header, policy, returns, lengths in self.evaluations.finished():
-            if not self.writes:
-                continue
-            row = header | {
-                "average_return": float(np.mean(returns)),
-                "std_return": float(np.std(returns)),
-                "min_return": min(returns),
-                "max_return": max(returns),
-                "average_episode_length": float(np.mean(lengths)),
-                "std_episode_length": float(np.std(lengths)),
-            }
-            self.log("eval" if policy else "random", row)
-            self.print(
-                f"{'step = ' + str(row['step']) if policy else 'random policy'}: "
-                f"AverageReturn = {row['average_return']:.6f} ± {row['std_return']:.6f}, "
-                f"AverageEpisodeLength = {row['average_episode_length']:.6f} ± {row['std_episode_length']:.6f}"
-            )
-            if policy:
-                self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
-            if policy and row["average_return"] > self.best_return:
-                self.best_return, self.best_weights = row["average_return"], policy.state_dict()
-                policy_file.save(self.path / "best_policy.pt2", policy)
+    def _in_pool(self, function, policy, arguments):
+        """Futures of `function(policy, task, *arguments)` in the pool's workers, for each of these arguments."""
+        file = self.scratch / f"{function.__name__}-{policy is None}"
+        file.write_bytes(pickle.dumps(policy))
+        return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
-    def stop_requested(self):
-        """Whether any rank was asked to stop (Ctrl-C or SIGTERM)."""
-        return self.ranks.any(self.stop.requested)
+    def save(self, step, env_steps, agent, buffer, environments):
+        """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for weights not finite."""
+        self.saved_step = step
+        random = {"cpu": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
+        own = {"buffer": buffer.state_dict(), "environments": environments.state_dict(), "random": random}
+        ranks = self.ranks.gather(own)
+        if not self.writes:
+            return
+        for name, parameter in agent.named_parameters():
+            if not parameter.isfinite().all():
+                raise RunError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
+        state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
+        state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
+        self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
+        self._save("checkpoint.pt", "checkpoint", state | {"tables": self.tables, "best": self.best})
 
-    def finish(self, step, policy_file, policy, film, reward_threshold):
-        """Waits for the evaluations, draws the curve, films, and says where everything lies.
+    def _save(self, name, kind, state):
+        state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
+        write_atomically(self.path / name, partial(torch.save, state))
 
-        After a stop nothing is waited for or filmed: the checkpoint has what is open. `film(policy, env_id, seed,
-        path)` films one episode, or is None. A video or a curve that fails costs a line, not the run.
+    def finish(self, step, policy, observation_space):
+        """Draws the curve, exports and films the policy, and says where everything lies. What fails costs a line.
+
+        After a stop it only draws the curve and says how to continue.
         """
-        stopped = self.stop_requested()
-        if self.evaluations.pending and not stopped:
-            self.print("waiting for the last evaluations …")
-        while self.evaluations.pending and not stopped:
-            self.report_evaluations(policy_file)
-            stopped = self.stop_requested()
-            time.sleep(0.05)
         if not self.writes:
             return
         self.progress.close()
-        if film and not stopped:
-            self.print("filming one episode of the trained and one of the random agent …")
-            seed = self.evaluations.seeds[0]
-            videos = [
-                self.evaluations.submit(film, agent, self.config.env_id, seed, self.path / name)
-                for agent, name in ((copy_to_cpu(policy), "trained_agent.mp4"), (None, "random_agent.mp4"))
-            ]
-            for video in videos:
-                while not video.done() and not self.stop.requested:
-                    time.sleep(0.05)
-                if video.done() and video.exception():
-                    self.print(f"warning: no video ({first_line(video.exception())})")
-            stopped = self.stop.requested
+        title = f"{self.config.env_id}, seed {self.config.seed}"
+        with self._or_warn("learning_curve.png"):
+            plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
+        if self.stopped:
+            return self.print(f"stopped at step {step}; {self._how_to_continue()}")
+        policy, films = copy.deepcopy(policy).cpu(), {}
+        if self.config.video:
+            self.print("filming one episode of the trained and one of the random agent ...")
+            seed = evaluation_seeds(self.config)[0]
+            for name, agent in (("trained_agent.mp4", policy), ("random_agent.mp4", None)):
+                films[name] = self._in_pool(film, agent, [(seed, self.path / name)])[0]
+        with self._or_warn("exported policy"):
+            export_policy(self.path / "policy.pt2", policy, observation_space.shape)
+            policy.load_state_dict(self.best["weights"])
+            export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
+        for name, recording in films.items():
+            with self._or_warn(name):
+                while not self.stopping and not recording.done():
+                    time.sleep(0.1)
+                recording.result(timeout=0)
+        files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
+        self.print(f"finished; {self.path} holds {files}")
+
+    @contextlib.contextmanager
+    def _or_warn(self, what):
         try:
-            random_return = self.tables["random"][0]["average_return"] if "random" in self.tables else None
-            title = f"{self.config.env_id}, seed {self.config.seed}"
-            plot_learning_curve(self.path / "learning_curve.png", self.tables, title, reward_threshold, random_return)
+            yield
         except Exception as error:
-            self.print(f"warning: no learning curve ({first_line(error)})")
-        if stopped:
-            ranks = self.ranks.world_size
-            python = "python" if ranks == 1 else f"torchrun --nproc-per-node {ranks}"
-            self.print(f"stopped at step {step}; to continue: {python} {self.script}.py --resume {self.path}")
-        else:
-            files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
-            self.print(f"finished; {self.path} holds {files}")
-
-    def save_checkpoint(self, shared, own):
-        """Saves the training state that all ranks share, rank by rank their own, and the run's."""
-        shared = shared | {
-            "config": dataclasses.asdict(self.config),
-            "tables": self.tables,
-            "best_return": self.best_return,
-            "best_weights": self.best_weights,
-            "seconds": time.monotonic() - self.started,
-            "evaluations": self.evaluations.state(),
-        }
-        save_checkpoint(self.path / "checkpoint.pt", self.script, shared, own, self.ranks)
+            self.print(f"warning: no {what} ({first_line(error)})")
 
 
-@contextlib.contextmanager
-def _tensorboard(path):
-    from torch.utils.tensorboard import SummaryWriter
+def evaluation_seeds(config):
+    """The seeds of a run's evaluation episodes, the same at every evaluation."""
+    return [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
 
-    writer = SummaryWriter(path)
-    # Its thread would print what it meets on a full disk, and raises it at the next row anyway.
-    others = threading.excepthook
-    threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or others(thread)
+
+def summarize(results):
+    """The metrics of evaluation episodes, from a list of (return, length), and a line that tells them."""
+    (mean, length), (spread, spread_length) = np.mean(results, axis=0).tolist(), np.std(results, axis=0).tolist()
+    returns = [episode_return for episode_return, _ in results]
+    row = {"average_return": mean, "std_return": spread, "min_return": min(returns), "max_return": max(returns)}
+    row |= {"average_episode_length": length, "std_episode_length": spread_length}
+    text = f"AverageReturn = {mean:.6f} +/- {spread:.6f}, AverageEpisodeLength = {length:.6f} +/- {spread_length:.6f}"
+    return row, text
+
+
+def evaluate_policy(config, script, policy, task, evaluate):
+    """What --evaluate PATH does: plays the episodes that the run was evaluated with, tells the returns and films one."""
     try:
-        yield writer
-    finally:
-        with contextlib.suppress(OSError):  # the same once more; the CSVs have said so already
-            writer.close()
-        threading.excepthook = others
+        policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
+    except RuntimeError:
+        raise InputError(f"{config.evaluate} does not fit {config.env_id} and the network of this script") from None
+    seeds = evaluation_seeds(config)
+    _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None)])
+    print(f"{config.evaluate}: {text}")
+    if config.video:
+        film(policy, task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
+        print(f"filmed one episode: {path}")
 
 
-def append_whole(path, data):
-    """Appends bytes to a file, or on a full disk nothing of them: what is in the file stays whole lines."""
-    with open(path, "ab", buffering=0) as file:
-        length = file.tell()
-        if file.write(data) != len(data):
-            file.truncate(length)
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def _csv_line(values):
-    line = io.StringIO()
-    csv.writer(line, lineterminator="\n").writerow(values)
-    return line.getvalue()
-
-
-# Checkpoints and exported policies
-
-
-def save_checkpoint(path, script, shared, own, ranks):
-    """Writes the state that all ranks share and every rank's own to one file (rank 0 does): tensors and plain values."""
-    own = ranks.gather(own)
-    if ranks.rank == 0:
-        state = {"format": CHECKPOINT_FORMAT, "script": script, "shared": shared, "ranks": own}
-        write_atomically(path, functools.partial(torch.save, state))
-
-
-def _require_whole(archive):
-    """Raises ValueError when a record's checksum is wrong, at which torch.load does not look."""
-    if damaged := archive.testzip():
-        raise ValueError(f"{damaged} is damaged")
-
-
-def load_checkpoint(path, script, ranks):
-    """Reads back (shared, own) as this rank saved them, on the CPU. Nothing in the file is executed.
-
-    Raises InputError, in one line, when the file is missing, damaged, foreign, of another script or format, or of
-    another number of processes.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            _require_whole(archive)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        format_, found, shared, own = (state[key] for key in ("format", "script", "shared", "ranks"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist: --resume takes the directory of a run that saved a checkpoint") from None
-    except Exception as error:  # whatever a damaged or hostile file provokes
-        raise InputError(f"{path} is not a whole checkpoint of this project ({first_line(error)})") from None
-    if found != script or format_ != CHECKPOINT_FORMAT:
-        raise InputError(f"{path} is a checkpoint of {found}, format {format_}; needed: {script}, format {CHECKPOINT_FORMAT}")
-    if len(own) != ranks.world_size:
-        raise InputError(f"{path} was saved by {len(own)} processes; continue it with as many, not {ranks.world_size}")
-    return shared, own[ranks.rank]
-
-
-def first_line(error):
-    return (str(error).splitlines() or [type(error).__name__])[0][:150]
-
-
-def resumed_config(config, script):
-    """`config` with the values saved in the checkpoint that it resumes, for the command line to be read over.
-
-    Raises InputError when there is none, or one of another version of the script: its defaults need not be today's.
-    """
-    path = Path(config.resume) / "checkpoint.pt"
-    shared, _ = load_checkpoint(path, script, Ranks.join())
-    if others := dataclasses.asdict(config).keys() ^ shared["config"].keys():
-        raise InputError(f"{path} was saved by another version of {script}.py, which differs in the field {min(others)}")
-    return dataclasses.replace(config, **shared["config"] | {"resume": config.resume})
-
-
-def require_same_run(config, saved):
-    """Raises InputError naming the first field of `config` that keeps it from continuing the one `saved`, a dict."""
-    if config.num_iterations < saved["num_iterations"]:
-        less = f"{config.num_iterations} is less than the {saved['num_iterations']} of the run to resume"
-        raise InputError(f"--num-iterations {less}: it may only be raised")
-    # All but the iterations decide what is done besides, not what is learned.
-    may_differ = {"num_iterations", "resume", "evaluate", "video", "checkpoint_interval"}
-    if config.run_dir in (None, config.resume):  # no other directory is asked for
-        may_differ.add("run_dir")
-    for name, new in dataclasses.asdict(config).items():
-        if name not in may_differ and new != (old := saved.get(name)):
-            flag = "--" + name.replace("_", "-")
-            raise InputError(f"{flag} {new} differs from the {old} of the run to resume: leave it out")
-
-
-class PolicyFile:
-    """A deterministic policy traced once with `torch.export`, for any batch size, to be saved with any weights."""
-
-    def __init__(self, policy, observation_shape):
-        self.policy = copy_to_cpu(policy)
-        example = torch.zeros((2, *observation_shape))
-        self.program = torch.export.export(
-            self.policy, (example,), dynamic_shapes=({0: torch.export.Dim("batch")},)
-        )
-
-    def save(self, path, policy):
-        """Writes `policy` with its weights of now, loadable by `torch.export.load(path).module()` with none of our code."""
-        self.policy.load_state_dict(policy.state_dict())  # the program refers to these very tensors
-        archive = io.BytesIO()  # torch.export.save into a file on a full disk ends the process
-        torch.export.save(self.program, archive)
-        write_atomically(path, lambda file: file.write(archive.getvalue()))
-
-
-def load_weights(path):
-    """The weights in a file of `PolicyFile`, name → float32 tensor. Nothing in the file is executed.
-
-    `torch.export.load`, which would return the whole program, unpickles and evaluates what it finds. Raises InputError
-    when the file is missing, damaged or foreign.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            _require_whole(archive)
-            folder = f"{archive.namelist()[0].partition('/')[0]}/data/weights"
-            weights = {}
-            for name, entry in json.loads(archive.read(f"{folder}/model_weights_config.json"))["config"].items():
-                values = torch.frombuffer(bytearray(archive.read(f"{folder}/{entry['path_name']}")), dtype=torch.float32)
-                weights[name] = values.view([size["as_int"] for size in entry["tensor_meta"]["sizes"]])
-            return weights
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist: --evaluate takes a policy.pt2 file") from None
-    except Exception as error:  # whatever a damaged or hostile file provokes
-        raise InputError(f"{path} is not a whole exported policy ({first_line(error)})") from None
-
-
-# What a person looks at
-
-
-def plot_learning_curve(path, tables, title, reward_threshold=None, random_return=None):
-    """Draws a run's returns with their spread beside its losses and mean Q, from the rows of `train` and `eval`."""
+def plot_learning_curve(path, tables, title, reward_threshold=None):
+    """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     returns, losses, values = figure.subplots(1, 3)
-    rows = tables.get("eval", [])
-    steps, mean, spread = (np.array([row[key] for row in rows]) for key in ("step", "average_return", "std_return"))
+    steps, mean, spread = (
+        np.array([row[key] for row in tables["eval"]]) for key in ("step", "average_return", "std_return")
+    )
     returns.plot(steps, mean, marker=".", label="deterministic policy, mean ± std")
     returns.fill_between(steps, mean - spread, mean + spread, alpha=0.2)
-    if random_return is not None:
-        returns.axhline(random_return, color="gray", linestyle=":", label="random policy")
+    for row in tables["random"]:
+        returns.axhline(row["average_return"], color="gray", linestyle=":", label="random policy")
     if reward_threshold is not None:
         returns.axhline(reward_threshold, color="green", linestyle="--", label="the task's threshold")
     returns.set(title=title, xlabel="gradient updates", ylabel="return")
     returns.legend(fontsize="small")
-    rows = tables.get("train", [])
-    for axes, keys, label in ((losses, ("loss", "critic_loss"), "loss"), (values, ("mean_q",), "mean Q")):
-        for key in keys:
-            if rows and key in rows[0]:
-                axes.plot([row["step"] for row in rows], [row[key] for row in rows])
-        axes.set(title=label, xlabel="gradient updates")
+    for axes, name, title in ((losses, "loss", "loss"), (losses, "critic_loss", "loss"), (values, "mean_q", "mean Q")):
+        points = [(row["step"], row[name]) for row in tables["train"] if name in row]
+        axes.plot(*zip(*points) if points else ([], []))
+        axes.set(title=title, xlabel="gradient updates")
     losses.set_yscale("log")
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
-def record_video(path, env, act, seed):
-    """Films one episode in real time, at 50 frames a second or fewer.
-
-    `env` renders `rgb_array`; `act(observation)` returns an action. The environment is closed afterwards, and the file
-    is whole or not there.
-    """
+def film(policy, task, seed, path):
+    """Films one episode of `policy` (None: random actions) in real time, at 50 frames a second or fewer."""
     import imageio
 
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
-    frames_per_second = env.metadata["render_fps"]
-    skip = math.ceil(frames_per_second / 50)
-    with contextlib.closing(env), replacing(path) as temporary:
-        writer = imageio.get_writer(temporary, fps=frames_per_second / skip, macro_block_size=2)
-        with contextlib.closing(writer) as video:  # its own context leaves it open after an error
-            observation, _ = env.reset(seed=seed)
-            done, step = False, 0
-            while not done:
-                if step % skip == 0:
-                    video.append_data(env.render())
-                observation, _, terminated, truncated, _ = env.step(act(observation))
-                done, step = terminated or truncated, step + 1
-            video.append_data(env.render())
-
-
-def require_finite(step, metrics):
-    """Raises RunError naming the step and the first of `metrics`, a dict of scalar tensors, that is not finite."""
-    if not metrics:
-        return
-    values = torch.stack(list(metrics.values())).tolist()  # one wait for a GPU instead of one for each
-    for name, value in zip(metrics, values):
-        if not math.isfinite(value):
-            raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
-
-
-def evaluate_policy_file(config, make_env, make_policy, evaluate, film):
-    """What `--evaluate PATH` does: plays the exported policy's episodes, prints their returns and films one.
-
-    `make_policy(weights, observation_space, action_space)` returns the script's own policy with these weights.
-    """
-    weights = load_weights(config.evaluate)
-    with make_env(config.env_id) as env:
-        try:
-            policy = make_policy(weights, env.observation_space, env.action_space)
-        except (KeyError, ValueError, RuntimeError):  # no layers, or others
-            raise InputError(f"{config.evaluate} is not a policy for {config.env_id}: name its task with --env-id") from None
-    seeds = [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
-    returns, lengths = zip(*(evaluate(policy, config.env_id, seed) for seed in tqdm(seeds, disable=None)))
-    print(
-        f"{config.evaluate}: AverageReturn = {np.mean(returns):.6f} ± {np.std(returns):.6f}, "
-        f"AverageEpisodeLength = {np.mean(lengths):.6f} ± {np.std(lengths):.6f}"
-    )
-    if config.video:
-        path = Path(config.evaluate).with_suffix(".mp4")
-        try:
-            film(policy, config.env_id, seeds[0], path)
-            print(f"filmed one episode: {path}")
-        except Exception as error:
-            print(f"warning: no video ({first_line(error)})")
+    temporary = path.with_name(f".tmp-{path.name}")
+    with contextlib.ExitStack() as stack:
+        stack.callback(temporary.unlink, missing_ok=True)
+        env = stack.enter_context(gym.make(task, render_mode="rgb_array"))
+        fps = env.metadata["render_fps"]
+        skip = math.ceil(fps / 50)
+        video = stack.enter_context(contextlib.closing(imageio.get_writer(temporary, fps=fps / skip, macro_block_size=2)))
+        env.action_space.seed(seed)
+        observation, _ = env.reset(seed=seed)
+        done, step = False, 0
+        while not done:
+            if step % skip == 0:
+                video.append_data(env.render())
+            action = policy.act(observation) if policy else env.action_space.sample()
+            observation, _, terminated, truncated, _ = env.step(action)
+            done, step = terminated or truncated, step + 1
+        video.append_data(env.render())
+        video.close()
+        os.replace(temporary, path)

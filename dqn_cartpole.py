@@ -3,133 +3,91 @@
     python dqn_cartpole.py                                    # less than a minute on two CPU cores, return 200
     python dqn_cartpole.py --env-id CartPole-v1 --num-iterations 50000
     python dqn_cartpole.py --resume runs/RUN                  # continues a run that was stopped or killed
-    python dqn_cartpole.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy
+    python dqn_cartpole.py --evaluate runs/RUN/policy.pt      # evaluates and films a saved policy
+    python dqn_cartpole.py --tutorial                         # the tutorial's own choices, which are less stable
     torchrun --nproc-per-node 2 dqn_cartpole.py               # two processes, one agent
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
-through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every value of theirs is a default here but
-those marked "ours" in `Config`. The tutorial discounts by 1 and bootstraps from the network of the step before, so
-that nothing bounds its values: its losses reach 1e10, and for one who trained on to 130 000 updates the return fell
-back to 12 to 32 (https://github.com/tensorflow/agents/issues/316). Here the observations come on one scale; values are
-discounted and start from what an endless episode is worth, so that only falling and leaving the track have to be
-learned, and in a unit in which that is a short way; they are bounded by it; a target network follows slowly, and values
-the action that the Q-network chooses (double DQN, which alone has no flag); the values of the two actions, nearly equal
-after so short a step, are pushed apart; and the learning rate decays.
+through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
+"ours" in `Config`. README gives the reason for each.
 """
 
 import math
 import warnings
-from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import InputError
+
+# That gymnasium has a v1, with 500 steps instead of the tutorial's 200, is no news here.
+warnings.filterwarnings("ignore", ".*environment CartPole-v0 is out of date", DeprecationWarning)
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=common.CONFIG)
 class Config:
     """Deep Q-learning on CartPole. Values are the tutorial's unless a line says "ours"."""
 
-    env_id: str = "CartPole-v0"
-    """a gymnasium task with a Discrete action space"""
-    num_iterations: int = 20_000
-    """gradient updates"""
-    initial_collect_steps: int = 100
-    """environment steps with random actions before the first update, over all processes"""
-    collect_steps_per_iteration: int = 1
-    """environment steps per gradient update, over all environments and processes"""
-    num_envs: int = 1
-    """environments that each process steps at once"""
-    replay_buffer_capacity: int = 100_000
-    """transitions kept by each process"""
-    batch_size: int = 64
-    """transitions per update, over all processes"""
+    env_id: str = "CartPole-v0"  # a gymnasium task with a Discrete action space
+    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
+    num_iterations: PositiveInt = 20_000  # gradient updates
+    initial_collect_steps: PositiveInt = 100  # steps with random actions before the first update, over all processes
+    collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
+    num_envs: PositiveInt = 1  # environments that each process steps at once
+    replay_buffer_capacity: PositiveInt = 100_000  # transitions kept by each process
+    batch_size: PositiveInt = 64  # transitions per update, over all processes
 
-    learning_rate: float = 1e-3
-    """Adam's, at the start"""
-    learning_rate_decay: int = 1_000
-    """ours (theirs: none): after this many updates the learning rate is half, after n times as many 1 / (1 + n)"""
-    adam_epsilon: float = 1e-7
-    """Adam's ε (Keras' default, which the tutorial leaves unsaid)"""
-    epsilon: float = 0.1
-    """probability of a random action while collecting (TF-Agents' default, which the tutorial leaves unsaid)"""
-    gamma: float = 0.99
-    """ours (TF-Agents' default, which the tutorial leaves unsaid: 1)"""
-    target_update_tau: float = 0.1
-    """ours (theirs: 1): step of the target network towards the Q-network, after every update"""
-    value_offset: bool = True
-    """ours (theirs: none): Q is the network's output plus what the mean initial reward is worth for ever"""
-    # Adam moves an output at the pace of its learning rate, whatever the output's unit: for values tens apart, a unit of
-    # one reward is a long way.
-    value_scale: float = 100.0
-    """ours (theirs: 1): Q changes by this where the network's output changes by 1"""
-    value_bound: bool = True
-    """ours (theirs: none): targets do not exceed what the largest reward seen so far is worth, for ever or once"""
-    # The other action comes 0.02 s later and undoes nearly all: without, their values differ by less than the network's
-    # errors.
-    advantage_learning: float = 0.9
-    """ours (theirs: none): a target is lowered by this part of what its action lacks to the best one"""
-    layers: tuple[int, ...] = (100, 50)
-    """hidden units of the Q-network"""
-    # The pole's angle ends at 0.2 and the cart's place at 2.4: unscaled, the network sees ten times as much of the place.
-    observation_scaling: bool = True
-    """ours (theirs: none): observations come within [-1, 1] where the task bounds them"""
+    learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
+    learning_rate_decay: PositiveInt = 1_000  # ours (theirs: none): updates after which the learning rate is halved
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorial leaves unsaid)
+    epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default, left unsaid)
+    gamma: Fraction = 0.99  # ours (TF-Agents' default, left unsaid: 1): discount
+    target_update_tau: Fraction = 0.1  # ours (theirs: 1): step of the target network towards the Q-network
+    value_offset: bool = True  # ours (theirs: none): Q is the network's output plus what the mean reward is worth for ever
+    value_scale: PositiveFloat = 100.0  # ours (theirs: 1): Q changes by this where the network's output changes by 1
+    value_bound: bool = True  # ours (theirs: none): no target exceeds what the largest reward is worth, for ever or once
+    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): part of the action gap that is added
+    layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
+    observation_scaling: bool = True  # ours (theirs: none): observations come within [-1, 1] where the task bounds them
+    tutorial: bool = False  # set every value marked "ours" back to the tutorial's; flags given beside it still count
 
-    seed: int = 0
-    """source of all randomness"""
-    device: str = "auto"
-    """auto, cpu, cuda, cuda:N or mps"""
-    num_threads: int = 1
-    """CPU threads of the update; networks this small gain nothing from more"""
-    run_dir: str | None = None
-    """a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)"""
-    resume: str | None = None
-    """directory of a run to continue from its last checkpoint"""
-    evaluate: str | None = None
-    """an exported policy (.pt2) to evaluate and film instead of training"""
-    video: bool = True
-    """film the trained and the random agent at the end"""
-    log_interval: int = 200
-    """updates between rows of train.csv"""
-    eval_interval: int = 1_000
-    """updates between evaluations"""
-    num_eval_episodes: int = 10
-    """episodes per evaluation"""
-    checkpoint_interval: int = 5_000
-    """updates between checkpoints, the policy's export among them"""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
+    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; more gain nothing here
+    run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
+    resume: Path | None = None  # directory of a run to continue from its last checkpoint
+    evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
+    video: bool = True  # film the trained and the random agent at the end
+    log_interval: PositiveInt = 200  # updates between rows of train.csv
+    eval_interval: PositiveInt = 1_000  # updates between evaluations
+    num_eval_episodes: PositiveInt = 10  # episodes per evaluation
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tutorial(cls, given):
+        return common.with_tutorial_values(given, TUTORIAL)
+
+    @model_validator(mode="after")
+    def _finite_worth(self):
+        if (self.value_offset or self.value_bound) and self.gamma == 1:
+            raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or no value offset and bound")
+        return self
 
 
-# The environment
-
-
-def make_env(env_id, **kwargs):
-    """The task as registered. Raises InputError when it is unknown or its spaces are not what DQN needs."""
-    try:
-        with warnings.catch_warnings():
-            # The tutorial's task: that gymnasium has a v1, with 500 steps instead of 200, is no news here.
-            warnings.filterwarnings("ignore", ".*environment CartPole-v0 is out of date", DeprecationWarning)
-            env = gym.make(env_id, **kwargs)
-    except (gym.error.Error, ImportError) as error:
-        raise InputError(f"--env-id {env_id} cannot be made: {common.first_line(error)}") from None
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
-        raise InputError(f"--env-id {env_id} has the observation space {observations}: a Box of some dimension is needed")
-    if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
-        raise InputError(f"--env-id {env_id} has the action space {actions}: DQN needs a Discrete from 0")
-    return env
-
-
-def make_training_env(env_id):
-    """The task with flat observations, as the agent sees it."""
-    env = make_env(env_id)
-    return env if len(env.observation_space.shape) == 1 else gym.wrappers.FlattenObservation(env)
+TUTORIAL = dict(
+    learning_rate_decay=2**53, gamma=1.0, target_update_tau=1.0, value_offset=False, value_scale=1.0, value_bound=False,
+    advantage_learning=0.0, observation_scaling=False,
+)  # fmt: skip
 
 
 # The network
@@ -182,25 +140,19 @@ class QNetwork(nn.Module):
 class Policy(nn.Module):
     """The greedy policy: what is evaluated, exported and filmed."""
 
-    def __init__(self, scaling, q_network):
+    def __init__(self, config, observation_space, action_space):
         super().__init__()
-        self.scaling, self.q_network = scaling, q_network
+        self.scaling = ObservationScaling(observation_space) if config.observation_scaling else nn.Identity()
+        self.q_network = QNetwork(math.prod(observation_space.shape), int(action_space.n), config.layers)
 
     def forward(self, observation):
         """Actions (batch,) for raw observations (batch, *observation shape)."""
         return self.q_network(self.scaling(observation.flatten(1))).argmax(1)
 
-
-def make_policy(weights, observation_space, action_space):
-    """The policy with exported weights (`common.load_weights`), which tell its layers' sizes too.
-
-    Raises ValueError or RuntimeError when they are of another task than one with these spaces.
-    """
-    *hidden_layers, _ = (len(w) for name, w in weights.items() if name.startswith("q_network") and w.dim() == 2)
-    scaling = ObservationScaling(observation_space) if "scaling.center" in weights else nn.Identity()
-    policy = Policy(scaling, QNetwork(math.prod(observation_space.shape), int(action_space.n), hidden_layers))
-    policy.load_state_dict(weights)
-    return policy
+    @torch.inference_mode()
+    def act(self, observation):
+        """The action for one raw observation: numpy to int."""
+        return int(self(torch.as_tensor(observation, dtype=torch.float32)[None]))
 
 
 # The replay buffer
@@ -219,8 +171,8 @@ class ReplayBuffer:
         self.size = self.position = 0
         self.largest_reward = -math.inf
 
-    def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions: (K, O), (K,), (K,), (K,), (K, O), as numpy arrays. Overwrites the oldest when full."""
+    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
+        """Stores K transitions: (K, O), (K,), (K,), (K,), (K,), (K, O), as numpy arrays, over the oldest when full."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
         self.largest_reward = max(self.largest_reward, float(rewards.max()))
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
@@ -239,12 +191,12 @@ class ReplayBuffer:
         """All that is stored of these: (size,)."""
         return self.rows[: self.size].split(self.sizes, dim=1)[2].squeeze(1)
 
-    def state(self):
+    def state_dict(self):
         """A copy of the filled part, for a checkpoint."""
         rows = self.rows[: self.size].to("cpu", copy=True)
         return {"rows": rows, "position": self.position, "largest_reward": self.largest_reward}
 
-    def load_state(self, state):
+    def load_state_dict(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
         self.largest_reward = state["largest_reward"]
         self.rows[: self.size] = state["rows"].to(self.rows.device)
@@ -276,7 +228,7 @@ def td_loss(q, targets):
     return F.mse_loss(q, targets)
 
 
-class DQNAgent:
+class DQNAgent(nn.Module):
     """The Q-network with its target and optimizer.
 
     The tutorial's network starts near Q = 0 and climbs to 1 / (1 − γ), a reward at a time, and meanwhile looks no
@@ -285,24 +237,19 @@ class DQNAgent:
     """
 
     def __init__(self, config, observation_space, action_space, device, ranks):
+        super().__init__()
         self.config, self.device, self.ranks = config, device, ranks
-        self.observation_size = math.prod(observation_space.shape)
         self.num_actions = int(action_space.n)
-        network_arguments = (self.observation_size, self.num_actions, config.layers)
-        self.q_network = QNetwork(*network_arguments).to(device)
-        self.target_network = QNetwork(*network_arguments).to(device).requires_grad_(False)
+        self.policy = Policy(config, observation_space, action_space)
+        self.scaling, self.q_network = self.policy.scaling, self.policy.q_network
+        network_arguments = (math.prod(observation_space.shape), self.num_actions, config.layers)
+        self.target_network = QNetwork(*network_arguments).requires_grad_(False)
         self.target_network.load_state_dict(self.q_network.state_dict())
-        self.scaling = ObservationScaling(observation_space).to(device) if config.observation_scaling else nn.Identity()
-        self.policy = Policy(self.scaling, self.q_network)
-        self.value_offset = torch.tensor(0.0, device=device)
-
-        self.parameters = list(self.q_network.parameters())
-        self.target_parameters = list(self.target_network.parameters())
+        self.register_buffer("value_offset", torch.tensor(0.0))
+        self.to(device)
         adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
-        self.optimizer = torch.optim.Adam(self.parameters, config.learning_rate, **adam)
-        # A policy that balances sees only states that are worth the same, and the noise of large steps upsets it again.
-        decay = config.learning_rate_decay
-        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimizer, lambda updates: 1 / (1 + updates / decay))
+        self.optimizer = torch.optim.Adam(self.q_network.parameters(), config.learning_rate, **adam)
+        self.optimizers = [self.optimizer]
 
     def random_actions(self, count):
         """Uniform actions (K,), numpy."""
@@ -311,7 +258,8 @@ class DQNAgent:
     def fit_offset(self, rewards):
         """Fixes the offset of Q from the rewards (N,) of the initial random data of all ranks."""
         if self.config.value_offset:
-            self.value_offset += self.ranks.mean(rewards.mean()) / (1 - self.config.gamma)
+            self.ranks.average([mean := rewards.mean()])
+            self.value_offset += mean / (1 - self.config.gamma)
 
     @torch.no_grad()
     def act(self, observations):
@@ -321,14 +269,16 @@ class DQNAgent:
         exploring = (torch.rand(len(greedy)) < self.config.epsilon).numpy()
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
-    def update(self, batch, largest_reward):
-        """One gradient step of the Q-network, then of its target.
+    def update(self, batch, step, largest_reward):
+        """One gradient step of the Q-network, then of its target, after `step` updates.
 
         `batch` is what `ReplayBuffer.sample` returns, `largest_reward` the largest ever stored. Returns the scalars to
         log, as tensors on the device: reading a number back here would make a GPU wait at every step.
         """
         config = self.config
         observations, actions, rewards, terminated, next_observations = batch
+        # A policy that balances sees only states that are worth the same, and the noise of large steps upsets it again.
+        self.optimizer.param_groups[0]["lr"] = config.learning_rate * (1 / (1 + step / config.learning_rate_decay))
         # Without it errors of extrapolation add up where all states are worth the same: the mean Q grew to twice as much.
         # Where every reward is a cost, the best that can happen is that the episode ends.
         bound = max(largest_reward, largest_reward / (1 - config.gamma)) if config.value_bound else math.inf
@@ -345,183 +295,99 @@ class DQNAgent:
         loss = td_loss(q, targets)
         self.optimizer.zero_grad()
         loss.backward()
-        self.ranks.average_gradients(self.parameters)
+        self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])
         self.optimizer.step()
-        self.schedule.step()
 
         with torch.no_grad():
-            torch._foreach_lerp_(self.target_parameters, self.parameters, config.target_update_tau)
+            for target, parameter in zip(self.target_network.parameters(), self.q_network.parameters()):
+                target.lerp_(parameter, config.target_update_tau)
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
-
-    def state(self):
-        """Everything that an update depends on and changes, for a checkpoint."""
-        return {
-            "q_network": self.q_network.state_dict(),
-            "target_network": self.target_network.state_dict(),
-            "value_offset": self.value_offset,
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict(),
-        }
-
-    def load_state(self, state):
-        for name, saved in state.items():
-            own = getattr(self, name)
-            if isinstance(own, torch.Tensor):
-                own.copy_(saved)
-            else:
-                own.load_state_dict(saved)
 
 
 # Evaluation
 
 
-@torch.inference_mode()
-def evaluate(policy, env_id, seed):
+def evaluate(policy, task, seed):
     """Return and length of one episode with the greedy `policy`, or with random actions where it is None."""
-    with make_env(env_id) as env:
+    with gym.make(task) as env:
         env.action_space.seed(seed)
         observation, _ = env.reset(seed=seed)
         episode_return, length, done = 0.0, 0, False
         while not done:
-            action = act(policy, observation) if policy else env.action_space.sample()
+            action = policy.act(observation) if policy else env.action_space.sample()
             observation, reward, terminated, truncated, _ = env.step(action)
             episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
     return episode_return, length
 
 
-@torch.inference_mode()
-def act(policy, observation):
-    """The policy's action for one raw observation: numpy to int."""
-    return int(policy(torch.as_tensor(observation, dtype=torch.float32)[None]))
-
-
-def film(policy, env_id, seed, path):
-    """Films one episode of the policy, or of random actions where it is None."""
-    env = make_env(env_id, render_mode="rgb_array")
-    env.action_space.seed(seed)
-    common.record_video(path, env, lambda o: act(policy, o) if policy else env.action_space.sample(), seed)
-
-
 # Training
 
 
-def check(config):
-    """Raises InputError for a value that no run could use."""
-    common.require_range(
-        config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
-        "replay_buffer_capacity", "batch_size", "learning_rate_decay", "layers", "log_interval",
-        "eval_interval", "num_eval_episodes", "checkpoint_interval",
-    )  # fmt: skip
-    common.require_range(config, 0, math.inf, "learning_rate", "adam_epsilon")
-    common.require_range(config, 0, 1, "epsilon", "gamma", "target_update_tau")
-    common.require_range(config, 0, 2**63 - 1, "seed")
-    common.require_range(config, 1, 1024, "num_threads")
-    common.require_batch(config)
-    if not 0 <= config.advantage_learning < 1:
-        raise InputError(f"--advantage-learning {config.advantage_learning} is not in [0, 1): the values would diverge")
-    if not 0 < config.value_scale < math.inf:
-        raise InputError(f"--value-scale {config.value_scale} is no scale: use a positive number")
-    if (config.value_offset or config.value_bound) and config.gamma >= 1:
-        raise InputError(
-            f"--gamma {config.gamma} makes an endless episode's worth infinite: use less than 1, "
-            "or --no-value-offset --no-value-bound"
-        )
+def make_training_env(task):
+    """The task with flat observations, as the agent sees it."""
+    env = gym.make(task)
+    return env if len(env.observation_space.shape) == 1 else gym.wrappers.FlattenObservation(env)
 
 
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
-    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays.
-
-    A resumed run equals one that was never interrupted: a checkpoint is taken between two iterations and holds the
-    agent, the replay, the random generators and the evaluations under way, and of the running episodes their seeds and
-    actions, which bring the environment back to the same state (`common.SeededEpisodes`).
+    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays. A resumed run
+    equals one that was never interrupted: a checkpoint holds the agent, the replay and the random generators, and of
+    the running episodes their seeds and actions, which bring the environment back to the same state.
     """
-    check(config)
-    with make_env(config.env_id) as env:
-        observation_space, action_space, spec = env.observation_space, env.action_space, env.spec
-    with common.Run(config, "dqn_cartpole", evaluate) as run:
-        ranks, saved = run.ranks, run.checkpoint
-        episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
+    task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
+    with common.Run(config, "dqn_cartpole", task, evaluate) as run:
+        batch_size = run.ranks.batch_share(config)
         # In this process: a step of CartPole costs less than a message to a worker.
-        envs = run.enter(episodes.open_envs(partial(make_training_env, config.env_id), in_workers=False))
+        envs = common.Environments(partial(make_training_env, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
-        agent = DQNAgent(config, observation_space, action_space, run.device, ranks)
-        buffer = ReplayBuffer(config.replay_buffer_capacity, agent.observation_size, run.device)
-        policy_file = common.PolicyFile(agent.policy, observation_space.shape)
-        torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
-        run.start(observation_space, action_space, buffer.rows.nbytes)
-
-        step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
-        if saved:
-            agent.load_state(saved["agent"])
-            buffer.load_state(saved.pop("buffer"))  # not kept beside it
-            common.set_random_state(saved["random"])
-            run.restart_evaluations(agent.policy, policy_file)
-        else:
-            run.start_evaluation(step, env_steps, policy=None)
-
-        def save():
-            if run.writes:
-                policy_file.save(run.path / "policy.pt2", agent.policy)
-            shared = {"step": step, "env_steps": env_steps, "agent": agent.state()}
-            own = {"buffer": buffer.state(), "episodes": episodes.state(), "random": common.random_state()}
-            run.save_checkpoint(shared, own)
-
-        save()
-        last_saved = step
-        stopping = False
-        steps_per_round = config.num_envs * ranks.world_size
-        observations, _ = envs.reset()
-        while step < config.num_iterations and not stopping:
+        agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
+        buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
+        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
+        step, env_steps = run.start(agent, buffer, envs)
+        if not env_steps:
+            run.save(step, env_steps, agent, buffer, envs)
+        run.evaluate(0, 0, policy=None)
+        while step < config.num_iterations:
             warming_up = env_steps < config.initial_collect_steps
-            actions = agent.random_actions(config.num_envs) if warming_up else agent.act(observations)
-            next_observations, rewards, terminated, truncated, infos = envs.step(actions)
-            env_steps += steps_per_round
-            done = terminated | truncated
-            buffer.add(observations, actions, rewards, terminated, common.last_observations(next_observations, infos))
-            episodes.record(actions, rewards, done)
-            observations = next_observations
+            if step % config.eval_interval == 0 and not warming_up:
+                run.evaluate(step, env_steps, agent.policy)
+            if run.stop_requested(step):
+                break
 
-            if warming_up and env_steps >= config.initial_collect_steps:
-                agent.fit_offset(buffer.rewards())
-                run.start_evaluation(step, env_steps, agent.policy)
-
-            metrics = {}
-            updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
-            while step < min(updates_due, config.num_iterations):
-                batch = buffer.sample(config.batch_size // ranks.world_size)
-                metrics = agent.update(batch, buffer.largest_reward)
+            # Collect, where the next update is due new experience.
+            due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
+            if env_steps < due:
+                envs.step_async(agent.random_actions(config.num_envs) if warming_up else agent.act(envs.observations))
+                buffer.add(*envs.step_wait())
+                env_steps += config.num_envs * run.ranks.world_size
+            if env_steps >= due and not warming_up:
+                metrics = agent.update(buffer.sample(batch_size), step, buffer.largest_reward)
                 step += 1
                 run.progress.update()
                 if step % config.log_interval == 0:
-                    run.log_training(step, env_steps, episodes, metrics)
-                if step % config.eval_interval == 0:
-                    run.start_evaluation(step, env_steps, agent.policy)
-            common.require_finite(step, metrics)
+                    run.log_training(step, env_steps, envs, metrics)
+            if warming_up and env_steps >= config.initial_collect_steps:
+                agent.fit_offset(buffer.rewards())
+            if step - run.saved_step >= config.checkpoint_interval:
+                run.save(step, env_steps, agent, buffer, envs)
 
-            if env_steps % 100 < steps_per_round:  # not at every step: between processes each look is a message
-                run.report_evaluations(policy_file)
-                stopping = run.stop_requested()
-            if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:
-                save()
-                last_saved = step
-
-        if step % config.eval_interval and not stopping:
-            run.start_evaluation(step, env_steps, agent.policy)
-        run.finish(step, policy_file, agent.policy, film if config.video else None, spec.reward_threshold)
+        if step > run.saved_step or run.stopped:
+            run.save(step, env_steps, agent, buffer, envs)
+        if not run.stopped:
+            run.evaluate(step, env_steps, agent.policy)
+        run.finish(step, agent.policy, observation_space)
         return run.path
 
 
 def main():
-    config = tyro.cli(Config, description=__doc__)
-    if config.resume is not None:
-        config = tyro.cli(Config, default=common.resumed_config(config, "dqn_cartpole"))
-    if config.evaluate is not None:
-        check(config)
-        common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)
-    else:
+    config = common.read_command_line(Config, __doc__, "dqn_cartpole")
+    if config.evaluate is None:
         train(config)
+    else:
+        task, *spaces = common.find_task(config, gym.spaces.Discrete)
+        common.evaluate_policy(config, "dqn_cartpole", Policy(config, *spaces), task, evaluate)
 
 
 if __name__ == "__main__":

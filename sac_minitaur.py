@@ -3,126 +3,546 @@
     python sac_minitaur.py                                    # half an hour to an hour on two CPU cores, return 25 to 32
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
-    python sac_minitaur.py --evaluate runs/RUN/policy.pt2     # evaluates and films a saved policy
+    python sac_minitaur.py --evaluate runs/RUN/policy.pt      # evaluates and films a saved policy
+    python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
-Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every value of theirs is a default here but those
-marked "ours" in `Config`, each for a reason that README gives.
+Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
+`Config`. README gives the reason for each.
 """
 
 import copy
+import dataclasses
 import math
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import InputError
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=common.CONFIG)
 class Config:
     """Soft Actor-Critic on the Minitaur. Values are the tutorials' unless a line says "ours"."""
 
-    env_id: str = "MinitaurBulletEnv-v0"
-    """a gymnasium task with a bounded Box action space"""
-    num_iterations: int = 100_000
-    """gradient updates"""
-    initial_collect_steps: int = 10_000
-    """environment steps with random actions before the first update, over all processes"""
-    collect_steps_per_iteration: int = 1
-    """environment steps per gradient update, over all environments and processes"""
-    num_envs: int = 1
-    """environments that each process steps at once, each in a worker process of its own"""
-    replay_buffer_capacity: int = 1_000_000
-    """transitions kept by each process (the 2018 tutorial's value; the later ones have 10 000)"""
-    batch_size: int = 256
-    """transitions per update, over all processes"""
+    env_id: str = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
+    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
+    num_iterations: PositiveInt = 100_000  # gradient updates
+    initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
+    collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
+    num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
+    replay_buffer_capacity: PositiveInt = 1_000_000  # transitions kept by each process (2018's value; 2021: 10 000)
+    batch_size: PositiveInt = 256  # transitions per update, over all processes
 
-    actor_learning_rate: float = 3e-4
-    """Adam's, for the actor"""
-    critic_learning_rate: float = 3e-4
-    """Adam's, for the critics"""
-    alpha_learning_rate: float = 3e-4
-    """Adam's, for log α"""
-    adam_epsilon: float = 1e-7
-    """Adam's ε (Keras' default, which the tutorials leave unsaid)"""
-    adam_beta1: float = 0.5
-    """ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient"""
-    # States of very different value look alike in the robot's observation. The policy sees no more than the task gives.
-    privileged_critics: bool = True
-    """ours (theirs: no): critics see the velocity and height too, where the environment tells them (arXiv:1710.06542)"""
-    # What is learned counts at the next update then. With target critics that takes a fifth of the run.
-    critic_batch_norm: bool = True
-    """ours (theirs: none): normalize the critics over the batch, without target critics (CrossQ, arXiv:1902.05605)"""
-    target_update_tau: float = 0.005
-    """step of the target critics, where there are any, towards the critics, after every update"""
-    gamma: float = 0.99
-    """discount"""
-    # One step of 0.01 s changes the return so little that the critics' errors hide it.
-    n_step: int = 3
-    """ours (theirs: 1): environment steps whose rewards a target sums before it bootstraps"""
-    # Values of a thousandth are lost in the noise of new critics.
-    reward_scaling: bool = True
-    """ours (theirs: none): divide the rewards by the spread of the initial random data's n-step returns, here 0.005"""
-    reward_scale_factor: float = 0.5
-    """ours (theirs: 1): factor of the rewards, after the division"""
-    # Every step of Adam changes the actor a little everywhere, and that of one moment may fall. Its average acts wherever
-    # no action is sampled.
-    averaged_actor_tau: float = 0.005
-    """ours (theirs: 1, the actor itself): step of the averaged actor towards the actor, after every update"""
-    # So that the replay holds the states that the policy, as it is evaluated, leads to.
-    mean_action_episodes: bool = True
-    """ours (theirs: none): every second episode is collected as an evaluation is, with the averaged actor's mean action"""
-    critic_loss_weight: float = 0.5
-    """factor of each critic's mean squared error (TF-Agents' default, which the tutorials leave unsaid)"""
-    target_entropy_per_action: float = -1.0
-    """ours, and the paper's −|A| (TF-Agents' default, which the tutorials leave unsaid: −|A|/2, so −0.5)"""
-    initial_log_alpha: float = -2.0
-    """ours (TF-Agents' default, which the tutorials leave unsaid: 0)"""
-    actor_layers: tuple[int, ...] = (256, 256)
-    """hidden units of the actor"""
-    critic_layers: tuple[int, ...] = (256, 256)
-    """hidden units of each critic"""
-    observation_scaling: bool = True
-    """ours (theirs: none): standardize observations by mean and standard deviation of the initial random data"""
+    actor_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the actor
+    critic_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the critics
+    alpha_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for log α
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorials leave unsaid)
+    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.5  # ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient
+    privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
+    critic_batch_norm: bool = True  # ours (theirs: no): normalize, and need no target critics (CrossQ, arXiv:1902.05605)
+    target_update_tau: Fraction = 0.005  # step of the target critics, if any, towards the critics after every update
+    gamma: Fraction = 0.99  # discount
+    n_step: PositiveInt = 3  # ours (theirs: 1): steps whose rewards a target sums before it bootstraps
+    reward_scaling: bool = True  # ours (theirs: no): divide rewards by the spread of the initial random data's returns
+    reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
+    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1, the actor itself): step of the evaluated average of the actor
+    mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the policy that is evaluated
+    critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default, left unsaid)
+    target_entropy_per_action: float = -1.0  # ours, the paper's −|A| (TF-Agents' default, left unsaid: −|A|/2, so −0.5)
+    initial_log_alpha: float = -2.0  # ours (TF-Agents' default, left unsaid: 0)
+    actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
+    critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
+    observation_scaling: bool = True  # ours (theirs: no): standardize by mean and spread of the initial random data
+    tutorial: bool = False  # set every value marked "ours" back to the tutorials'; flags given beside it still count
 
-    seed: int = 0
-    """source of all randomness"""
-    device: str = "auto"
-    """auto, cpu, cuda, cuda:N or mps"""
-    num_threads: int = 1
-    """CPU threads of the update; the physics and the evaluations want the other cores"""
-    run_dir: str | None = None
-    """a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)"""
-    resume: str | None = None
-    """directory of a run to continue from its last checkpoint"""
-    evaluate: str | None = None
-    """an exported policy (.pt2) to evaluate and film instead of training"""
-    video: bool = True
-    """film the trained and the random agent at the end"""
-    log_interval: int = 5_000
-    """updates between rows of train.csv"""
-    eval_interval: int = 10_000
-    """updates between evaluations"""
-    num_eval_episodes: int = 20
-    """episodes per evaluation"""
-    checkpoint_interval: int = 5_000
-    """updates between checkpoints, the policy's export among them"""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
+    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; the physics wants another core
+    run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
+    resume: Path | None = None  # directory of a run to continue from its last checkpoint
+    evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
+    video: bool = True  # film the trained and the random agent at the end
+    log_interval: PositiveInt = 5_000  # updates between rows of train.csv
+    eval_interval: PositiveInt = 10_000  # updates between evaluations
+    num_eval_episodes: PositiveInt = 20  # episodes per evaluation
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tutorial(cls, given):
+        return common.with_tutorial_values(given, TUTORIAL)
 
 
-# The environment
+TUTORIAL = dict(
+    replay_buffer_capacity=10_000, adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, n_step=1,
+    reward_scaling=False, reward_scale_factor=1.0, averaged_actor_tau=1.0, mean_action_episodes=False,
+    target_entropy_per_action=-0.5, initial_log_alpha=0.0, observation_scaling=False,
+)  # fmt: skip
 
 
-@dataclass(frozen=True)
+# The networks
+
+
+def mlp(inputs, hidden_layers, outputs, batch_norm=False):
+    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization).
+
+    With `batch_norm` the input of each layer is normalized; momentum and ε are CrossQ's.
+    """
+    layers = []
+    for units in (*hidden_layers, outputs):
+        if batch_norm:
+            layers.append(nn.BatchNorm1d(inputs, momentum=0.01, eps=1e-3))
+        layers += [nn.Linear(inputs, units), nn.ReLU(inplace=True)]
+        inputs = units
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers[:-1])  # no ReLU after the outputs
+
+
+class ObservationScaling(nn.Module):
+    """Standardizes observations (…, S) by a fixed mean and standard deviation, clipped to ±10; the identity until `fit`."""
+
+    def __init__(self, observation_size):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(observation_size))
+        self.register_buffer("std", torch.ones(observation_size))
+        self.register_buffer("limit", torch.full((observation_size,), torch.inf))
+
+    def fit(self, observations, ranks):
+        """Takes mean and standard deviation from observations (N, S) of all ranks."""
+        ranks.average([mean := observations.mean(0)])
+        ranks.average([variance := (observations - mean).square().mean(0)])
+        self.mean.copy_(mean)
+        # What hardly moves under random actions may move later: its deviation is not taken for less than 0.01.
+        self.std.copy_(variance.sqrt().clamp(min=0.01))
+        self.limit.fill_(10.0)
+
+    def forward(self, observation):
+        return ((observation - self.mean) / self.std).clamp(-self.limit, self.limit)
+
+
+class Actor(nn.Module):
+    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O numbers of an observation."""
+
+    def __init__(self, observation_size, action_size, hidden_layers):
+        super().__init__()
+        self.observation_size = observation_size
+        self.net = mlp(observation_size, hidden_layers, 2 * action_size)
+
+    def forward(self, observation):
+        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O or more)."""
+        mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
+        return mean, log_std.clamp(-20, 2)
+
+    def sample(self, observation):
+        """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
+
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The subtracted term
+        equals 2 (log 2 − u − softplus(−2u)) exactly, and does not round to log 0 where tanh saturates.
+        """
+        mean, log_std = self(observation)
+        noise = torch.randn_like(mean)
+        u = mean + log_std.exp() * noise
+        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
+        return u.tanh(), (log_normal - log_determinant).sum(-1)
+
+
+class TwinCritics(nn.Module):
+    """Two estimates of Q(s, a), independent of each other but for their data."""
+
+    def __init__(self, observation_size, action_size, hidden_layers, batch_norm):
+        super().__init__()
+        self.q1 = mlp(observation_size + action_size, hidden_layers, 1, batch_norm)
+        self.q2 = mlp(observation_size + action_size, hidden_layers, 1, batch_norm)
+
+    def forward(self, observation, action):
+        """(2, …) for scaled observations (…, S) and actions (…, A)."""
+        x = torch.cat((observation, action), dim=-1)
+        return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
+
+
+class Policy(nn.Module):
+    """The deterministic policy, in the task's own units: what is evaluated, exported and filmed."""
+
+    def __init__(self, config, observation_space, action_space):
+        super().__init__()
+        self.action_space = action_space
+        observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
+        self.scaling = ObservationScaling(observation_size)
+        self.actor = Actor(observation_size, action_size, config.actor_layers)
+        self.register_buffer("low", torch.as_tensor(action_space.low, dtype=torch.float32))
+        self.register_buffer("high", torch.as_tensor(action_space.high, dtype=torch.float32))
+
+    def forward(self, observation):
+        """Actions (batch, *action shape) for raw observations (batch, *observation shape)."""
+        mean, _ = self.actor(self.scaling(observation.flatten(1)))
+        return to_bounds(mean.tanh().unflatten(1, self.low.shape), self.low, self.high)
+
+    @torch.inference_mode()
+    def act(self, observation):
+        """The action for one raw observation, numpy to numpy, in the action space's own type."""
+        action = self(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
+        require_finite(action)
+        return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
+
+
+def to_bounds(action, low, high):
+    """Maps an action from [-1, 1] to [low, high], of which rounding could miss the ends."""
+    return ((low + high) / 2 + (high - low) / 2 * action).clip(low, high)
+
+
+def require_finite(actions):
+    """Raises RunError unless all of the actions are finite: the task would meet what training has not yet noticed."""
+    if not np.isfinite(actions).all():
+        raise common.RunError("the actor's actions are not finite: learning diverged; a smaller learning rate may help")
+
+
+# The replay buffer
+
+
+class ReplayBuffer:
+    """The last `capacity` n-step transitions, on the training device, in float32, each one row of one tensor.
+
+    A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
+    last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
+    time limit has not ended, and its last state has a value. Towards the end of an episode fewer than n steps are
+    left: n is then their number. Sampling is a single gather.
+    """
+
+    def __init__(self, capacity, state_size, action_size, n_step, gamma, num_envs, device):
+        self.sizes = (state_size, action_size, 1, 1, state_size)
+        self.n_step, self.gamma = n_step, gamma
+        self.rows = common.empty_replay(capacity, sum(self.sizes), device)
+        self.size = self.position = 0
+        # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
+        self.incomplete = [deque() for _ in range(num_envs)]
+
+    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
+        """Takes a step of each of K environments: (K, S), (K, …), (K,), (K,), (K,), (K, S), as numpy arrays.
+
+        Stores the transitions that it completes, over the oldest when full.
+        """
+        for k, steps in enumerate(self.incomplete):
+            steps.append((observations[k], actions[k].ravel(), rewards[k]))
+            ended = terminated[k] or truncated[k]
+            while len(steps) == self.n_step or (ended and steps):
+                n_step_return = sum(self.gamma**i * reward for i, (_, _, reward) in enumerate(steps))
+                discount = 0.0 if terminated[k] else self.gamma ** len(steps)
+                observation, action, _ = steps.popleft()
+                row = np.concatenate((observation, action, (n_step_return, discount), next_observations[k]))
+                self.rows[self.position].copy_(torch.from_numpy(row))
+                self.position = (self.position + 1) % len(self.rows)
+                self.size = min(self.size + 1, len(self.rows))
+
+    def sample(self, batch_size):
+        """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
+        indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
+        observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
+        return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
+
+    def observations_and_returns(self):
+        """All that is stored of these: (size, S), (size,)."""
+        observations, _, returns, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return observations, returns.squeeze(1)
+
+    def state_dict(self):
+        """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
+        incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
+        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position, "incomplete": incomplete}
+
+    def load_state_dict(self, state):
+        self.size, self.position = len(state["rows"]), state["position"]
+        self.rows[: self.size] = state["rows"].to(self.rows.device)
+        for steps, saved in zip(self.incomplete, state["incomplete"]):
+            steps.extend(tuple(value.numpy() for value in step) for step in saved)
+
+
+# The agent
+
+
+def td_targets(returns, discounts, next_q, next_log_probs, alpha):
+    """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
+
+    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
+    reward and γ (1 − terminated), n of them and the discount after them (the entropy of the steps between is left out).
+    """
+    return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
+
+
+def critic_loss(q, targets, weight):
+    """The sum over the twins of `weight` × mean squared error: q (2, B), targets (B,)."""
+    return weight * (q - targets).square().mean(1).sum()
+
+
+def actor_loss(log_probs, q, alpha):
+    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). Equation 7."""
+    return (alpha * log_probs - q.amin(0)).mean()
+
+
+def alpha_loss(log_alpha, log_probs, target_entropy):
+    """−log α × (log π + target entropy), averaged: raises α while the entropy is below its target. log_probs (B,).
+
+    TF-Agents' default: equation 18 of arXiv:1812.05905 has α in place of log α, with the same sign of the gradient.
+    """
+    return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
+
+
+class SACAgent(nn.Module):
+    """Actor, twin critics and the temperature α, with their optimizers, and the policy that is evaluated.
+
+    The actor sees the task's observation, O numbers. The critics see `state_size` numbers, S: the task's first, then
+    what only they see. The policy's actor is a running average of the actor: one snapshot of the policy may fall.
+    """
+
+    def __init__(self, config, observation_space, action_space, state_size, device, ranks):
+        super().__init__()
+        self.config, self.device, self.ranks, self.action_shape = config, device, ranks, action_space.shape
+        observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
+        self.target_entropy = config.target_entropy_per_action * action_size
+        self.scaling = ObservationScaling(state_size)
+        self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))
+        self.actor = Actor(observation_size, action_size, config.actor_layers)
+        self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
+        # With batch normalization there are no target critics (CrossQ).
+        self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
+        self.log_alpha = nn.Parameter(torch.tensor(config.initial_log_alpha))
+        self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
+        self.policy.actor.load_state_dict(self.actor.state_dict())
+        self.to(device)
+
+        adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
+        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
+        # One optimizer for the actor and α, which learn from the same sample of actions.
+        groups = [
+            {"params": list(self.actor.parameters()), "lr": config.actor_learning_rate},
+            {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
+        ]
+        self.actor_optimizer = torch.optim.Adam(groups, **adam)
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer]
+
+    def random_actions(self, count):
+        """Uniform actions (K, *action shape) in [-1, 1], numpy."""
+        return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
+
+    @torch.no_grad()
+    def fit_scaling(self, observations, returns):
+        """Fixes the scales of observations and rewards by observations (N, S) and n-step returns (N,) of all ranks."""
+        if self.config.observation_scaling:
+            self.scaling.fit(observations, self.ranks)
+            for own, full in zip(self.policy.scaling.buffers(), self.scaling.buffers()):
+                own.copy_(full[: len(own)])  # the policy does not see what only the critics see
+        if self.config.reward_scaling:
+            self.ranks.average([mean := returns.mean()])
+            self.ranks.average([variance := (returns - mean).square().mean()])
+            std = variance.sqrt()
+            self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
+
+    @torch.no_grad()
+    def act(self, observations, sampled):
+        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), numpy to numpy.
+
+        They are drawn from the actor where `sampled` (K,) is true. Elsewhere they are the evaluated policy's.
+        """
+        observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
+        actions, _ = self.actor.sample(observations)
+        mean, _ = self.policy.actor(observations)
+        actions = torch.where(torch.as_tensor(sampled, device=self.device)[:, None], actions, mean.tanh())
+        actions = actions.view(-1, *self.action_shape).cpu().numpy()
+        require_finite(actions)
+        return actions
+
+    def update(self, batch):
+        """One gradient step of the critics, then of the actor and α; the averages follow.
+
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
+        number back here would make a GPU wait at every step.
+        """
+        config = self.config
+        s, a, returns, discounts, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
+        s, next_s = self.scaling(s), self.scaling(next_s)
+        returns = self.reward_scale * returns
+        alpha = self.log_alpha.detach().exp()
+
+        # The critics: Q(s, a) moves towards y = R + discount (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s').
+        with torch.no_grad():
+            next_a, next_log_probs = self.actor.sample(next_s)  # (B, A), (B,)
+        if self.target_critics:
+            q = self.critics(s, a)  # (2, B)
+            next_q = self.target_critics(next_s, next_a)  # (2, B)
+        else:
+            # Both in one pass: normalized apart, what the replay did and what the actor would do could not be compared.
+            self.critics.train()
+            q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
+            self.critics.eval()
+        with torch.no_grad():
+            y = td_targets(returns, discounts, next_q, next_log_probs, alpha)  # (B,)
+        loss_q = critic_loss(q, y, config.critic_loss_weight)  # w Σ mean (Q − y)²
+        self._step(self.critic_optimizer, loss_q, self.critics.buffers())
+
+        # The actor: α log π(a|s) − min Q(s, a) falls, with a ~ π(·|s). α falls while the entropy is above its target.
+        new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
+        loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
+        loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
+        self._step(self.actor_optimizer, loss_pi + loss_alpha)
+
+        # θ̄ ← θ̄ + τ (θ − θ̄)
+        follow(self.policy.actor, self.actor, config.averaged_actor_tau)
+        if self.target_critics:
+            follow(self.target_critics, self.critics, config.target_update_tau)
+        return {
+            "critic_loss": loss_q.detach(),
+            "actor_loss": loss_pi.detach(),
+            "alpha_loss": loss_alpha.detach(),
+            "alpha": alpha,
+            "entropy": -log_probs.detach().mean(),
+            "mean_q": q.detach().mean(),
+        }
+
+    def _step(self, optimizer, loss, statistics=()):
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        optimizer.zero_grad()
+        loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
+        # Several processes: the mean of their gradients, and of batch normalization's running statistics.
+        statistics = [buffer for buffer in statistics if buffer.is_floating_point()]
+        self.ranks.average([parameter.grad for parameter in parameters] + statistics)
+        optimizer.step()
+
+
+@torch.no_grad()
+def follow(average, module, tau):
+    """Moves the parameters of `average` by the fraction `tau` towards those of `module`."""
+    for mean, parameter in zip(average.parameters(), module.parameters()):
+        mean.lerp_(parameter, tau)
+
+
+# Evaluation
+
+
+def evaluate(policy, task, seed):
+    """Return and length of one episode with the deterministic `policy`, or with random actions where it is None."""
+    with gym.make(task) as env:
+        env.action_space.seed(seed)
+        observation, _ = env.reset(seed=seed)
+        episode_return, length, done = 0.0, 0, False
+        while not done:
+            action = policy.act(observation) if policy else env.action_space.sample()
+            observation, reward, terminated, truncated, _ = env.step(action)
+            episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
+    return episode_return, length
+
+
+# Training
+
+
+class AppendPrivileged(gym.ObservationWrapper):
+    """Ends every observation (O,) with the environment's `privileged_observation()` (P,), which only critics see."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        own, privileged = env.observation_space, env.unwrapped.privileged_space
+        self.observation_space = gym.spaces.Box(np.append(own.low, privileged.low), np.append(own.high, privileged.high))
+
+    def observation(self, observation):
+        return np.append(observation, self.unwrapped.privileged_observation())
+
+
+def make_training_env(task, privileged):
+    """The task with flat observations and actions in [-1, 1], as the agent sees it in training.
+
+    With `privileged` the observations end with what only the critics see, where the environment has that.
+    """
+    env = gym.make(task)
+    low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
+    if (low != -1).any() or (high != 1).any() or dtype != np.float32:
+        unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
+        env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
+    if len(env.observation_space.shape) != 1:
+        env = gym.wrappers.FlattenObservation(env)
+    return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
+
+
+def train(config):
+    """Trains as `config` says and returns the run directory's path.
+
+    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays. A resumed run
+    equals one that was never interrupted: a checkpoint holds the agent, the replay and the random generators, and of
+    the running episodes their seeds and actions, which bring the simulator back to the same state.
+    """
+    task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
+    with common.Run(config, "sac_minitaur", task, evaluate) as run:
+        # An environment's last n - 1 steps are not in the buffer yet.
+        batch_size = run.ranks.batch_share(config, held_back=config.num_envs * (config.n_step - 1))
+        envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
+        torch.manual_seed(config.seed)  # the same networks on every rank
+        agent = SACAgent(config, observation_space, action_space, envs.observation_size, run.device, run.ranks)
+        buffer = ReplayBuffer(
+            config.replay_buffer_capacity, envs.observation_size, math.prod(action_space.shape), config.n_step,
+            config.gamma, config.num_envs, run.device,
+        )  # fmt: skip
+        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
+        step, env_steps = run.start(agent, buffer, envs)
+        if not env_steps:
+            run.save(step, env_steps, agent, buffer, envs)
+        run.evaluate(0, 0, policy=None)
+        while step < config.num_iterations:
+            warming_up = env_steps < config.initial_collect_steps
+            if step % config.eval_interval == 0 and not warming_up:
+                run.evaluate(step, env_steps, agent.policy)
+            if run.stop_requested(step):
+                break
+
+            # Collect, where the next update is due new experience. The physics runs beside that update.
+            due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
+            collecting = env_steps < due
+            if collecting:
+                if warming_up:
+                    actions = agent.random_actions(config.num_envs)
+                else:
+                    by_policy = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # every second episode
+                    actions = agent.act(envs.observations, sampled=~by_policy)
+                envs.step_async(actions)
+                env_steps += config.num_envs * run.ranks.world_size
+            if env_steps >= due and not warming_up:
+                metrics = agent.update(buffer.sample(batch_size))
+                step += 1
+                run.progress.update()
+                if step % config.log_interval == 0:
+                    run.log_training(step, env_steps, envs, metrics)
+            if collecting:
+                buffer.add(*envs.step_wait())
+            if warming_up and env_steps >= config.initial_collect_steps:
+                agent.fit_scaling(*buffer.observations_and_returns())
+            if step - run.saved_step >= config.checkpoint_interval:
+                run.save(step, env_steps, agent, buffer, envs)
+
+        if step > run.saved_step or run.stopped:
+            run.save(step, env_steps, agent, buffer, envs)
+        if not run.stopped:
+            run.evaluate(step, env_steps, agent.policy)
+        run.finish(step, agent.policy, observation_space)
+        return run.path
+
+
+# The Minitaur
+
+
+@dataclasses.dataclass(frozen=True)
 class Dynamics:
     """What the Minitaur draws anew at every reset. Ranges: pybullet's minitaur_env_randomizer.py."""
 
@@ -345,573 +765,13 @@ if "MinitaurBulletEnv-v0" not in gym.registry:
     )
 
 
-def make_env(env_id, **kwargs):
-    """The task as registered. Raises InputError when it is unknown or its spaces are not what SAC needs."""
-    try:
-        env = gym.make(env_id, **kwargs)
-    except (gym.error.Error, ImportError) as error:
-        raise InputError(f"--env-id {env_id} cannot be made: {common.first_line(error)}") from None
-    observations, actions = env.observation_space, env.action_space
-    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
-        raise InputError(f"--env-id {env_id} has the observation space {observations}: a Box of some dimension is needed")
-    if not (isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f" and actions.is_bounded()):
-        raise InputError(f"--env-id {env_id} has the action space {actions}: SAC needs a bounded Box of real numbers")
-    if not (actions.low < actions.high).all():
-        raise InputError(f"--env-id {env_id} has the action space {actions}: SAC needs room between its bounds")
-    return env
-
-
-class AppendPrivileged(gym.ObservationWrapper):
-    """Ends every observation (O,) with the environment's `privileged_observation()` (P,), which only critics see."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        own, privileged = env.observation_space, env.unwrapped.privileged_space
-        self.observation_space = gym.spaces.Box(np.append(own.low, privileged.low), np.append(own.high, privileged.high))
-
-    def observation(self, observation):
-        return np.append(observation, self.unwrapped.privileged_observation())
-
-
-def make_training_env(env_id, privileged):
-    """The task with flat observations and actions in [-1, 1], as the agent sees it in training.
-
-    With `privileged` the observations end with what only the critics see, where the environment has that.
-    """
-    env = make_env(env_id)
-    if (env.action_space.low != -1).any() or (env.action_space.high != 1).any():
-        env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    if len(env.observation_space.shape) != 1:
-        env = gym.wrappers.FlattenObservation(env)
-    return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
-
-
-# The networks
-
-
-class BatchNorm(nn.BatchNorm1d):
-    """Normalizes features (B, F) by mean and variance of the batch, all ranks' together; in `eval` mode by running ones.
-
-    Momentum and ε are CrossQ's.
-    """
-
-    def __init__(self, features, ranks):
-        super().__init__(features, momentum=0.01, eps=1e-3)
-        self.ranks = ranks
-
-    def forward(self, x):
-        if self.ranks.world_size == 1 or not self.training:
-            return super().forward(x)
-        mean, mean_square = self.ranks.mean(torch.stack((x.mean(0), x.square().mean(0))))
-        variance = mean_square - mean.square()
-        with torch.no_grad():
-            batch_size = len(x) * self.ranks.world_size
-            self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(variance * batch_size / (batch_size - 1), self.momentum)
-            self.num_batches_tracked += 1
-        return (x - mean) * (variance + self.eps).rsqrt() * self.weight + self.bias
-
-
-def mlp(inputs, hidden_layers, outputs, normalization=None):
-    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization).
-
-    `normalization(features)`, if any, makes a layer for the input of each.
-    """
-    layers = []
-    for units in (*hidden_layers, outputs):
-        if normalization:
-            layers.append(normalization(inputs))
-        layers += [nn.Linear(inputs, units), nn.ReLU(inplace=True)]
-        inputs = units
-    layers.pop()  # nothing after the outputs
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
-
-
-class ObservationScaling(nn.Module):
-    """Standardizes observations (…, S) by a fixed mean and standard deviation, clipped to ±10; the identity until `fit`.
-
-    A shorter one, without what only the critics see, is scaled by the first S' of these.
-    """
-
-    def __init__(self, observation_size):
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(observation_size))
-        self.register_buffer("std", torch.ones(observation_size))
-        self.register_buffer("limit", torch.tensor(torch.inf))
-
-    def fit(self, observations, ranks):
-        """Takes mean and standard deviation from observations (N, S), over all ranks."""
-        mean = ranks.mean(observations.mean(0))
-        variance = ranks.mean((observations - mean).square().mean(0))
-        self.mean.copy_(mean)
-        # What hardly moves under random actions may move later: its deviation is not taken for less than 0.01.
-        self.std.copy_(variance.sqrt().clamp(min=0.01))
-        self.limit.fill_(10.0)
-
-    def forward(self, observation):
-        size = observation.shape[-1]
-        return ((observation - self.mean[:size]) / self.std[:size]).clamp(-self.limit, self.limit)
-
-
-class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O numbers of an observation."""
-
-    def __init__(self, observation_size, action_size, hidden_layers):
-        super().__init__()
-        self.observation_size = observation_size
-        self.net = mlp(observation_size, hidden_layers, 2 * action_size)
-
-    def forward(self, observation):
-        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O or more)."""
-        mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
-        return mean, log_std.clamp(-20, 2)
-
-    def sample(self, observation):
-        """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
-
-        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The subtracted term
-        equals 2 (log 2 − u − softplus(−2u)) exactly, and does not round to log 0 where tanh saturates.
-        """
-        mean, log_std = self(observation)
-        noise = torch.randn_like(mean)
-        u = mean + log_std.exp() * noise
-        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
-        return u.tanh(), (log_normal - log_determinant).sum(-1)
-
-
-class TwinCritics(nn.Module):
-    """Two estimates of Q(s, a), independent of each other but for their data."""
-
-    def __init__(self, observation_size, action_size, hidden_layers, normalization=None):
-        super().__init__()
-        inputs = observation_size + action_size
-        self.q1 = mlp(inputs, hidden_layers, 1, normalization)
-        self.q2 = mlp(inputs, hidden_layers, 1, normalization)
-
-    def forward(self, observation, action):
-        """(2, …) for scaled observations (…, S) and actions (…, A)."""
-        x = torch.cat((observation, action), dim=-1)
-        return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
-
-
-class Policy(nn.Module):
-    """The deterministic policy, in the task's own units: what is evaluated, exported and filmed."""
-
-    def __init__(self, scaling, actor, action_space):
-        super().__init__()
-        self.scaling, self.actor = scaling, actor
-        low, high = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
-        self.register_buffer("center", (low + high) / 2)
-        self.register_buffer("half_range", (high - low) / 2)
-
-    def forward(self, observation):
-        """Actions (batch, *action shape) for raw observations (batch, *observation shape)."""
-        mean, _ = self.actor(self.scaling(observation.flatten(1)))
-        return self.center + self.half_range * mean.tanh().unflatten(1, self.center.shape)
-
-
-def make_policy(weights, observation_space, action_space):
-    """The policy with exported weights (`common.load_weights`), which tell its layers' sizes too.
-
-    Raises KeyError, ValueError or RuntimeError when they are of another task than one with these spaces.
-    """
-    *hidden_layers, outputs = (len(w) for name, w in weights.items() if name.startswith("actor") and w.dim() == 2)
-    observation_size = math.prod(observation_space.shape)
-    actor = Actor(observation_size, outputs // 2, hidden_layers)
-    scaling = ObservationScaling(weights["scaling.mean"].numel())  # of what only the critics see as well
-    policy = Policy(scaling, actor, action_space)
-    policy.load_state_dict(weights)
-    return policy
-
-
-# The replay buffer
-
-
-class ReplayBuffer:
-    """The last `capacity` n-step transitions, on the training device, in float32, each one row of one tensor.
-
-    A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
-    last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
-    time limit has not ended, and its last state has a value. Towards the end of an episode fewer than n steps are
-    left: n is then their number. Sampling is a single gather.
-    """
-
-    def __init__(self, capacity, state_size, action_size, n_step, gamma, num_envs, device):
-        self.sizes = (state_size, action_size, 1, 1, state_size)
-        self.n_step, self.gamma = n_step, gamma
-        self.rows = common.empty_replay(capacity, sum(self.sizes), device)
-        self.size = self.position = 0
-        # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
-        self.incomplete = [deque() for _ in range(num_envs)]
-
-    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Takes a step of each of K environments: (K, S), (K, …), (K,), (K,), (K,), (K, S), as numpy arrays.
-
-        Stores the transitions that it completes, over the oldest when full.
-        """
-        for k, steps in enumerate(self.incomplete):
-            steps.append((observations[k], actions[k].ravel(), rewards[k]))
-            ended = terminated[k] or truncated[k]
-            while len(steps) == self.n_step or (ended and steps):
-                n_step_return = sum(self.gamma**i * reward for i, (_, _, reward) in enumerate(steps))
-                discount = 0.0 if terminated[k] else self.gamma ** len(steps)
-                observation, action, _ = steps.popleft()
-                row = np.concatenate((observation, action, (n_step_return, discount), next_observations[k]))
-                self.rows[self.position].copy_(torch.from_numpy(row))
-                self.position = (self.position + 1) % len(self.rows)
-                self.size = min(self.size + 1, len(self.rows))
-
-    def sample(self, batch_size):
-        """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
-        indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
-        observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
-        return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
-
-    def observations_and_returns(self):
-        """All that is stored of these: (size, S), (size,)."""
-        observations, _, returns, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
-        return observations, returns.squeeze(1)
-
-    def state(self):
-        """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
-        incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
-        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position, "incomplete": incomplete}
-
-    def load_state(self, state):
-        self.size, self.position = len(state["rows"]), state["position"]
-        self.rows[: self.size] = state["rows"].to(self.rows.device)
-        for steps, saved in zip(self.incomplete, state["incomplete"]):
-            steps.extend(tuple(value.numpy() for value in step) for step in saved)
-
-
-# The agent
-
-
-def td_targets(returns, discounts, next_q, next_log_probs, alpha):
-    """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
-
-    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
-    reward and γ (1 − terminated), n of them and the discount after them (the entropy of the steps between is left out).
-    """
-    return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
-
-
-def critic_loss(q, targets, weight):
-    """The sum over the twins of `weight` × mean squared error: q (2, B), targets (B,)."""
-    return weight * (q - targets).square().mean(1).sum()
-
-
-def actor_loss(log_probs, q, alpha):
-    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). Equation 7."""
-    return (alpha * log_probs - q.amin(0)).mean()
-
-
-def alpha_loss(log_alpha, log_probs, target_entropy):
-    """−log α × (log π + target entropy), averaged: raises α while the entropy is below its target. log_probs (B,).
-
-    TF-Agents' default: equation 18 of arXiv:1812.05905 has α in place of log α, with the same sign of the gradient.
-    """
-    return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
-
-
-class SACAgent:
-    """Actor, twin critics with their targets, and the temperature α, with their optimizers.
-
-    The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: first the task's, then
-    what only they see (by default nothing more).
-    """
-
-    def __init__(self, config, observation_space, action_space, device, ranks, state_size=None):
-        self.config, self.device, self.ranks = config, device, ranks
-        self.action_shape = action_space.shape
-        observation_size = math.prod(observation_space.shape)
-        self.state_size = state_size = state_size or observation_size
-        self.action_size = action_size = math.prod(action_space.shape)
-        self.target_entropy = config.target_entropy_per_action * action_size
-        self.scaling = ObservationScaling(state_size).to(device)
-        self.reward_scale = torch.tensor(float(config.reward_scale_factor), device=device)
-        self.actor = Actor(observation_size, action_size, config.actor_layers).to(device)
-        normalization = partial(BatchNorm, ranks=ranks) if config.critic_batch_norm else None
-        self.critics = TwinCritics(state_size, action_size, config.critic_layers, normalization).to(device)
-        # With batch normalization there are none (CrossQ).
-        self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_alpha = torch.tensor(float(config.initial_log_alpha), device=device, requires_grad=True)
-        self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
-        self.policy = Policy(self.scaling, self.averaged_actor, action_space).to(device)
-
-        self.actor_parameters, self.critic_parameters = list(self.actor.parameters()), list(self.critics.parameters())
-        self.averaged_parameters = list(self.averaged_actor.parameters())
-        self.target_parameters = list(self.target_critics.parameters()) if self.target_critics else []
-        adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
-        self.critic_optimizer = torch.optim.Adam(self.critic_parameters, config.critic_learning_rate, **adam)
-        # One optimizer for the actor and α, which learn from the same sample of actions.
-        groups = [
-            {"params": self.actor_parameters, "lr": config.actor_learning_rate},
-            {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
-        ]
-        self.actor_optimizer = torch.optim.Adam(groups, **adam)
-
-    def random_actions(self, count):
-        """Uniform actions (K, *action shape) in [-1, 1], numpy."""
-        return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
-
-    def fit_scaling(self, observations, returns):
-        """Fixes the scales of observations and rewards by observations (N, S) and n-step returns (N,) of all ranks."""
-        if self.config.observation_scaling:
-            self.scaling.fit(observations, self.ranks)
-        if self.config.reward_scaling:
-            mean = self.ranks.mean(returns.mean())
-            std = self.ranks.mean((returns - mean).square().mean()).sqrt()
-            self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
-
-    @torch.no_grad()
-    def act(self, observations, sampled):
-        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), numpy to numpy.
-
-        They are drawn from the policy where `sampled` (K,) is true; elsewhere they are the averaged actor's mean.
-        """
-        observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
-        actions, _ = self.actor.sample(observations)
-        mean, _ = self.averaged_actor(observations)
-        actions = torch.where(torch.as_tensor(sampled, device=self.device)[:, None], actions, mean.tanh())
-        return actions.view(-1, *self.action_shape).cpu().numpy()
-
-    def update(self, batch):
-        """One gradient step of the critics, then of the actor and α; the averages follow.
-
-        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
-        number back here would make a GPU wait at every step.
-        """
-        config = self.config
-        observations, actions, returns, discounts, next_observations = batch
-        observations, next_observations = self.scaling(observations), self.scaling(next_observations)
-        returns = self.reward_scale * returns
-        alpha = self.log_alpha.detach().exp()
-
-        with torch.no_grad():
-            next_actions, next_log_probs = self.actor.sample(next_observations)
-        if self.target_critics:
-            q = self.critics(observations, actions)
-            next_q = self.target_critics(next_observations, next_actions)
-        else:
-            # Both in one pass: normalized apart, what the replay did and what the actor would do could not be compared.
-            self.critics.train()
-            both = torch.cat((observations, next_observations)), torch.cat((actions, next_actions))
-            q, next_q = self.critics(*both).chunk(2, dim=1)
-            self.critics.eval()
-        with torch.no_grad():
-            targets = td_targets(returns, discounts, next_q, next_log_probs, alpha)
-        loss_q = critic_loss(q, targets, config.critic_loss_weight)
-        self._step(self.critic_optimizer, loss_q, self.critic_parameters)
-
-        new_actions, log_probs = self.actor.sample(observations)
-        loss_pi = actor_loss(log_probs, self.critics(observations, new_actions), alpha)
-        loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-        self._step(self.actor_optimizer, loss_pi + loss_alpha, [*self.actor_parameters, self.log_alpha])
-
-        with torch.no_grad():
-            torch._foreach_lerp_(self.averaged_parameters, self.actor_parameters, config.averaged_actor_tau)
-            if self.target_critics:
-                torch._foreach_lerp_(self.target_parameters, self.critic_parameters, config.target_update_tau)
-        return {
-            "critic_loss": loss_q.detach(),
-            "actor_loss": loss_pi.detach(),
-            "alpha_loss": loss_alpha.detach(),
-            "alpha": alpha,
-            "entropy": -log_probs.detach().mean(),
-            "mean_q": q.detach().mean(),
-        }
-
-    def _step(self, optimizer, loss, parameters):
-        optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
-        self.ranks.average_gradients(parameters)
-        optimizer.step()
-
-    def state(self):
-        """Everything that an update depends on and changes, for a checkpoint."""
-        state = {
-            "scaling": self.scaling.state_dict(),
-            "actor": self.actor.state_dict(),
-            "averaged_actor": self.averaged_actor.state_dict(),
-            "critics": self.critics.state_dict(),
-            "log_alpha": self.log_alpha.detach(),
-            "reward_scale": self.reward_scale,
-            "critic_optimizer": self.critic_optimizer.state_dict(),
-            "actor_optimizer": self.actor_optimizer.state_dict(),
-        }
-        return state | ({"target_critics": self.target_critics.state_dict()} if self.target_critics else {})
-
-    def load_state(self, state):
-        for name, saved in state.items():
-            own = getattr(self, name)
-            if isinstance(own, torch.Tensor):
-                own.detach().copy_(saved)
-            else:
-                own.load_state_dict(saved)
-
-
-# Evaluation
-
-
-@torch.inference_mode()
-def evaluate(policy, env_id, seed):
-    """Return and length of one episode with the deterministic `policy`, or with random actions where it is None."""
-    with make_env(env_id) as env:
-        env.action_space.seed(seed)
-        observation, _ = env.reset(seed=seed)
-        episode_return, length, done = 0.0, 0, False
-        while not done:
-            action = act(policy, observation) if policy else env.action_space.sample()
-            observation, reward, terminated, truncated, _ = env.step(action)
-            episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
-    return episode_return, length
-
-
-@torch.inference_mode()
-def act(policy, observation):
-    """The policy's action for one raw observation, numpy to numpy."""
-    return policy(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
-
-
-def film(policy, env_id, seed, path):
-    """Films one episode of the policy, or of random actions where it is None."""
-    env = make_env(env_id, render_mode="rgb_array")
-    env.action_space.seed(seed)
-    common.record_video(path, env, lambda o: act(policy, o) if policy else env.action_space.sample(), seed)
-
-
-# Training
-
-
-def check(config):
-    """Raises InputError for a value that no run could use."""
-    common.require_range(
-        config, 1, math.inf, "num_iterations", "initial_collect_steps", "collect_steps_per_iteration", "num_envs",
-        "replay_buffer_capacity", "batch_size", "n_step", "actor_layers", "critic_layers", "log_interval",
-        "eval_interval", "num_eval_episodes", "checkpoint_interval",
-    )  # fmt: skip
-    common.require_range(
-        config, 0, math.inf, "actor_learning_rate", "critic_learning_rate", "alpha_learning_rate", "adam_epsilon",
-        "reward_scale_factor", "critic_loss_weight",
-    )  # fmt: skip
-    common.require_range(config, 0, 1, "target_update_tau", "gamma", "averaged_actor_tau")
-    common.require_range(config, 0, math.nextafter(1, 0), "adam_beta1")
-    common.require_range(config, -math.inf, math.inf, "target_entropy_per_action", "initial_log_alpha")
-    common.require_range(config, 0, 2**63 - 1, "seed")
-    common.require_range(config, 1, 1024, "num_threads")
-    # Every environment's last transitions are not complete yet.
-    common.require_batch(config, held_back=config.num_envs * (config.n_step - 1))
-
-
-def train(config):
-    """Trains as `config` says and returns the run directory's path.
-
-    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays.
-
-    A resumed run equals one that was never interrupted: a checkpoint is taken between two iterations and holds the
-    agent, the replay, the random generators and the evaluations under way, and of the running episodes their seeds and
-    actions, which bring the simulator back to the same state (`common.SeededEpisodes`).
-    """
-    check(config)
-    with make_env(config.env_id) as env:
-        observation_space, action_space, spec = env.observation_space, env.action_space, env.spec
-    with common.Run(config, "sac_minitaur", evaluate) as run:
-        ranks, saved = run.ranks, run.checkpoint
-        episodes = common.Episodes(config.num_envs, config.seed, ranks.rank * config.num_envs, saved.get("episodes"))
-        make_one = partial(make_training_env, config.env_id, config.privileged_critics)
-        envs = run.enter(episodes.open_envs(make_one, in_workers=True))
-        torch.manual_seed(config.seed)  # the same networks on every rank
-        state_size = envs.single_observation_space.shape[0]
-        agent = SACAgent(config, observation_space, action_space, run.device, ranks, state_size)
-        buffer = ReplayBuffer(
-            config.replay_buffer_capacity, agent.state_size, agent.action_size, config.n_step, config.gamma,
-            config.num_envs, run.device,
-        )  # fmt: skip
-        policy_file = common.PolicyFile(agent.policy, observation_space.shape)
-        torch.manual_seed(common.episode_seed(config.seed, ranks.rank))  # different actions and batches
-        run.start(observation_space, action_space, buffer.rows.nbytes)
-
-        step, env_steps = saved.get("step", 0), saved.get("env_steps", 0)
-        if saved:
-            agent.load_state(saved["agent"])
-            buffer.load_state(saved.pop("buffer"))  # not kept beside it
-            common.set_random_state(saved["random"])
-            run.restart_evaluations(agent.policy, policy_file)
-        else:
-            run.start_evaluation(step, env_steps, policy=None)
-
-        def save():
-            if run.writes:
-                policy_file.save(run.path / "policy.pt2", agent.policy)
-            shared = {"step": step, "env_steps": env_steps, "agent": agent.state()}
-            own = {"buffer": buffer.state(), "episodes": episodes.state(), "random": common.random_state()}
-            run.save_checkpoint(shared, own)
-
-        save()
-        last_saved = step
-        stopping = False
-        steps_per_round = config.num_envs * ranks.world_size
-        observations, _ = envs.reset()
-        while step < config.num_iterations and not stopping:
-            warming_up = env_steps < config.initial_collect_steps
-            if warming_up:
-                actions = agent.random_actions(config.num_envs)
-            else:
-                by_mean = config.mean_action_episodes & (np.array(episodes.number) % 2 == 1)  # every second episode
-                actions = agent.act(observations, sampled=~by_mean)
-            envs.step_async(actions)  # the physics runs beside the updates, which sample what was stored before
-            env_steps += steps_per_round
-
-            metrics = {}
-            updates_due = (env_steps - config.initial_collect_steps) // config.collect_steps_per_iteration
-            while not warming_up and step < min(updates_due, config.num_iterations):
-                metrics = agent.update(buffer.sample(config.batch_size // ranks.world_size))
-                step += 1
-                run.progress.update()
-                if step % config.log_interval == 0:
-                    run.log_training(step, env_steps, episodes, metrics)
-                if step % config.eval_interval == 0:
-                    run.start_evaluation(step, env_steps, agent.policy)
-
-            next_observations, rewards, terminated, truncated, infos = envs.step_wait()
-            done = terminated | truncated
-            last_observations = common.last_observations(next_observations, infos)
-            buffer.add(observations, actions, rewards, terminated, truncated, last_observations)
-            episodes.record(actions, rewards, done)
-            observations = next_observations
-            common.require_finite(step, metrics)
-
-            if warming_up and env_steps >= config.initial_collect_steps:
-                agent.fit_scaling(*buffer.observations_and_returns())
-                run.start_evaluation(step, env_steps, agent.policy)
-            if env_steps % 100 < steps_per_round:  # not at every step: between processes each look is a message
-                run.report_evaluations(policy_file)
-                stopping = run.stop_requested()
-            if step - last_saved >= config.checkpoint_interval or step == config.num_iterations or stopping:
-                save()
-                last_saved = step
-
-        if step % config.eval_interval and not stopping:
-            run.start_evaluation(step, env_steps, agent.policy)
-        run.finish(step, policy_file, agent.policy, film if config.video else None, spec.reward_threshold)
-        return run.path
-
-
 def main():
-    config = tyro.cli(Config, description=__doc__)
-    if config.resume is not None:
-        config = tyro.cli(Config, default=common.resumed_config(config, "sac_minitaur"))
-    if config.evaluate is not None:
-        check(config)
-        common.evaluate_policy_file(config, make_env, make_policy, evaluate, film)
-    else:
+    config = common.read_command_line(Config, __doc__, "sac_minitaur")
+    if config.evaluate is None:
         train(config)
+    else:
+        task, *spaces = common.find_task(config, gym.spaces.Box)
+        common.evaluate_policy(config, "sac_minitaur", Policy(config, *spaces), task, evaluate)
 
 
 if __name__ == "__main__":
