@@ -464,6 +464,7 @@ class Run:
         self.path = config.resume or config.run_dir or Path("runs") / name
         self.tables = self.checkpoint.get("tables", {"train": [], "eval": [], "random": []})
         self.best = self.checkpoint.get("best", {"return": -math.inf, "weights": None})
+        self.snapshots = self.checkpoint.get("snapshots", [])  # captions and weights, for the film of how it learned
         self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.last_logged = time.monotonic(), self.saved_step
@@ -640,10 +641,10 @@ class Run:
         if not self.writes or any(row["step"] == step for row in self.tables[table][-1:]):
             return
         policy = policy and copy.deepcopy(policy).cpu()
-        episodes = self._in_pool(self.evaluate_episode, policy, [(seed,) for seed in evaluation_seeds(self.config)])
-        while futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION).not_done and not self.stopping:
-            if any(episode.done() and episode.exception() for episode in episodes):
-                break
+        seeds = [(seed,) for seed in evaluation_seeds(self.config)]
+        episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
+        while not self.stopping and futures.wait(episodes, timeout=0.1).not_done:
+            pass
         if self.stopping:
             return [episode.cancel() for episode in episodes]
         row, text = summarize([episode.result() for episode in episodes])
@@ -651,15 +652,22 @@ class Run:
         self.print(f"{f'step = {step}' if policy else 'random policy'}: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
+            # Five policies, closer to each other at the beginning, where most is learned.
+            if step >= (len(self.snapshots) / 4) ** 2 * self.config.num_iterations:
+                caption = f"{step} updates: return {row['average_return']:.1f}"
+                self.snapshots.append((caption, policy.state_dict()))
             if row["average_return"] > self.best["return"]:
                 self.best = {"return": row["average_return"], "weights": policy.state_dict()}
                 self._save("best_policy.pt", "policy", {"weights": self.best["weights"]})
 
-    def _in_pool(self, function, policy, arguments):
+    def _in_pool(self, function, policy, name, arguments):
         """Futures of `function(policy, task, *arguments)` in the pool's workers, for each of these arguments."""
-        file = self.scratch / f"{function.__name__}-{policy is None}"
+        file = self.scratch / name  # the pool's own queue would send handles of shared memory
         file.write_bytes(pickle.dumps(policy))
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
+
+    def _film(self, policies, name, *arguments):
+        return self._in_pool(film, policies, name, [(evaluation_seeds(self.config)[0], self.path / name, *arguments)])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for weights not finite."""
@@ -677,7 +685,7 @@ class Run:
         state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
-        self._save("checkpoint.pt", "checkpoint", state | {"tables": self.tables, "best": self.best})
+        self._save("checkpoint.pt", "checkpoint", state | {"tables": self.tables, "best": self.best, "snapshots": self.snapshots})
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
@@ -698,10 +706,14 @@ class Run:
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:
-            self.print("filming one episode of the trained and one of the random agent ...")
-            seed = evaluation_seeds(self.config)[0]
-            for name, agent in (("trained_agent.mp4", policy), ("random_agent.mp4", None)):
-                films[name] = self._in_pool(film, agent, [(seed, self.path / name)])[0]
+            self.print("filming the trained agent, a random one, and how it learned ...")
+            learning = [copy.deepcopy(policy) for _ in self.snapshots]
+            for each, (_, weights) in zip(learning, self.snapshots):
+                each.load_state_dict(weights)
+            captions = [caption for caption, _ in self.snapshots]
+            films["learning.mp4"] = self._film(learning, "learning.mp4", captions, 4, 25)
+            films["trained_agent.mp4"] = self._film([policy], "trained_agent.mp4")
+            films["random_agent.mp4"] = self._film([None], "random_agent.mp4")
         with self._or_warn("exported policy"):
             export_policy(self.path / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.best["weights"])
@@ -747,7 +759,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None)])
     print(f"{config.evaluate}: {text}")
     if config.video:
-        film(policy, task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
+        film([policy], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
         print(f"filmed one episode: {path}")
 
 
@@ -776,27 +788,37 @@ def plot_learning_curve(path, tables, title, reward_threshold=None):
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
-def film(policy, task, seed, path):
-    """Films one episode of `policy` (None: random actions) in real time, at 50 frames a second or fewer."""
+def film(policies, task, seed, path, captions=(None,), seconds=math.inf, max_fps=50):
+    """Films the first `seconds` of one episode of each policy (None: random actions), in real time.
+
+    A policy's caption is written into its part. There are at most `max_fps` frames a second.
+    """
     import imageio
+    from PIL import Image, ImageDraw, ImageFont
 
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
-    temporary = path.with_name(f".tmp-{path.name}")
-    with contextlib.ExitStack() as stack:
-        stack.callback(temporary.unlink, missing_ok=True)
-        env = stack.enter_context(gym.make(task, render_mode="rgb_array"))
-        fps = env.metadata["render_fps"]
-        skip = math.ceil(fps / 50)
-        video = stack.enter_context(contextlib.closing(imageio.get_writer(temporary, fps=fps / skip, macro_block_size=2)))
-        env.action_space.seed(seed)
-        observation, _ = env.reset(seed=seed)
-        done, step = False, 0
-        while not done:
-            if step % skip == 0:
-                video.append_data(env.render())
-            action = policy.act(observation) if policy else env.action_space.sample()
-            observation, _, terminated, truncated, _ = env.step(action)
-            done, step = terminated or truncated, step + 1
-        video.append_data(env.render())
-        video.close()
-        os.replace(temporary, path)
+
+    def frame(caption):
+        image = Image.fromarray(env.render())
+        if caption:
+            ImageDraw.Draw(image).text((8, 8), caption, "black", ImageFont.load_default(20), stroke_width=2, stroke_fill="white")
+        return np.asarray(image)
+
+    def write(file):
+        skip = math.ceil(env.metadata["render_fps"] / max_fps)
+        fps = env.metadata["render_fps"] / skip
+        with contextlib.closing(imageio.get_writer(file.name, fps=fps, macro_block_size=2)) as video:
+            for policy, caption in zip(policies, captions):
+                env.action_space.seed(seed)
+                observation, _ = env.reset(seed=seed)
+                done, step = False, 0
+                while not done and step < seconds * env.metadata["render_fps"]:
+                    if step % skip == 0:
+                        video.append_data(frame(caption))
+                    action = policy.act(observation) if policy else env.action_space.sample()
+                    observation, _, terminated, truncated, _ = env.step(action)
+                    done, step = terminated or truncated, step + 1
+                video.append_data(frame(caption))
+
+    with gym.make(task, render_mode="rgb_array") as env:
+        write_atomically(path, write)
