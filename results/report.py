@@ -1,7 +1,6 @@
-"""Makes README's tables and figures from the CSVs beside this file: `python results/report.py`.
+"""Prints README's tables and draws its figures from the CSVs beside this file: `python results/report.py`.
 
-`results/<experiment>/seed<k>/` holds the `eval.csv`, `train.csv` and `config.json` of one run, `tutorials.csv` what the
-TF-Agents tutorials print.
+`results/<experiment>/seed<k>/` holds the CSVs of one run. `tutorials.csv` holds what the TF-Agents tutorials print.
 """
 
 import csv
@@ -13,7 +12,7 @@ from statistics import mean, median
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).resolve().parent
-# Name → title, the task's threshold, what is ours in it (experiment → label), the tutorials' runs.
+# File name → title, the task's threshold, our experiments (directory → label), the tutorials' runs.
 FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
@@ -21,16 +20,7 @@ FIGURES = {
         {"sac_minitaur": "ours", "sac_unprivileged": "ours without privileged critics"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
-    "sac_minitaur_long": (
-        "SAC on the Minitaur, longer runs",
-        15.0,
-        {
-            "sac_minitaur_long": "ours",
-            "sac_unprivileged_long": "without privileged critics",
-            "sac_minitaur_last_reward_long": "without them, last reward observed",
-        },
-        (),
-    ),
+    "sac_minitaur_long": ("SAC on the Minitaur, longer runs", 15.0, {"sac_minitaur_long": "ours"}, ()),
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
@@ -85,7 +75,7 @@ def print_table(experiment, goal, late):
         final, length = rows[-1]["average_return"], rows[-1]["average_episode_length"]
         best = max(at.values())
         worst = min((value for step, value in at.items() if step >= late), default=math.nan)
-        # An untrained network may balance by luck (DQN's seed 4).
+        # Step 0 does not count: an untrained network may balance by luck.
         first = next((step for step, value in at.items() if step > 0 and value >= goal), math.inf)
         summary.append((early, later, final, length, best, worst, first))
         print(f"| {seed} | {number(early)} | {number(later)} | {with_spread(rows[-1])} | {length:.0f}", end="")
@@ -124,15 +114,15 @@ def print_ablation(base, step, more):
 def draw(name, title, threshold, ours, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    for color, (experiment, label) in zip(("C0", "C2", "C3"), ours.items()):
+    for color, (experiment, label) in zip(("C0", "C2"), ours.items()):
         curves = runs(experiment)
         at = [returns_by_step(rows) for rows in curves.values()]
         for returns in at:
             axes.plot(list(returns), list(returns.values()), color=color, linewidth=0.7, alpha=0.6)
         steps = sorted(set.intersection(*map(set, at)))
         middle = [median(returns[step] for returns in at) for step in steps]
-        counted = f"median of {len(curves)} seeds (each thin)" if len(curves) > 1 else "one seed"
-        axes.plot(steps, middle, color=color, linewidth=2.5, label=f"{label}, {counted}")
+        label += f", median of {len(curves)} seeds (each thin)"
+        axes.plot(steps, middle, color=color, linewidth=2.5, label=label)
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
         label = f"tutorial, {run.rpartition('_')[2]}"
@@ -145,17 +135,15 @@ def draw(name, title, threshold, ours, published):
 
 
 def main():
-    for path in sorted(RESULTS.glob("sac*")):
-        if path.is_dir() and "_without_" not in path.name:
-            print_table(path.name, goal=15, late=50_000)
-    for path in sorted(RESULTS.glob("sac*_long")):
-        print_stretches(path.name, (100_000, 200_000, 400_000, 600_000, 800_000, 1_000_000))
+    for name in sorted({path.parts[-3] for path in RESULTS.glob("*/seed*/eval.csv")}):
+        if name.startswith("dqn"):
+            print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
+        elif "_without_" not in name:
+            print_table(name, goal=15, late=50_000)
+    print_stretches("sac_minitaur_long", (100_000, 200_000, 400_000, 600_000, 800_000, 1_000_000))
     exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
     print_ablation("sac_minitaur", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
     print_ablation("sac_unprivileged", 30_000, {})
-    for path in sorted(RESULTS.glob("dqn*")):
-        if path.is_dir():
-            print_table(path.name, goal=475 if "_v1" in path.name else 200, late=10_000)
     for name, figure in FIGURES.items():
         draw(name, *figure)
 
