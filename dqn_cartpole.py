@@ -21,7 +21,7 @@ from typing import Annotated
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -47,17 +47,15 @@ class Config:
     batch_size: PositiveInt = 64  # transitions per update, over all processes
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
-    learning_rate_decay: PositiveInt = 1_000  # ours (theirs: none): updates after which the learning rate is halved
+    learning_rate_decay: PositiveInt | None = 1_000  # ours (theirs: None): updates after which the learning rate is half
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorial leaves unsaid)
     epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default, left unsaid)
     gamma: Fraction = 0.99  # ours (TF-Agents' default, left unsaid: 1): discount
-    target_update_tau: Fraction = 0.1  # ours (theirs: 1): step of the target network towards the Q-network
-    value_offset: bool = True  # ours (theirs: none): Q is the network's output plus what the mean reward is worth for ever
-    value_scale: PositiveFloat = 100.0  # ours (theirs: 1): Q changes by this where the network's output changes by 1
-    value_bound: bool = True  # ours (theirs: none): no target exceeds what the largest reward is worth, for ever or once
-    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): part of the action gap that is added
+    target_update_tau: Fraction = 0.02  # ours (theirs: 1): step of the target network towards the Q-network
+    value_unit: bool = True  # ours (theirs: no): the network's output counts in the worth of an endless episode
+    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): how far actions are pushed apart
+    observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
-    observation_scaling: bool = True  # ours (theirs: none): observations come within [-1, 1] where the task bounds them
     tutorial: bool = False  # set every value marked "ours" back to the tutorial's; flags given beside it still count
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
@@ -79,14 +77,14 @@ class Config:
 
     @model_validator(mode="after")
     def _finite_worth(self):
-        if (self.value_offset or self.value_bound) and self.gamma == 1:
-            raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or no value offset and bound")
+        if self.value_unit and self.gamma == 1:
+            raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or --no-value-unit")
         return self
 
 
 TUTORIAL = dict(
-    learning_rate_decay=2**53, gamma=1.0, target_update_tau=1.0, value_offset=False, value_scale=1.0, value_bound=False,
-    advantage_learning=0.0, observation_scaling=False,
+    learning_rate_decay=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
+    observation_scaling=False,
 )  # fmt: skip
 
 
@@ -103,6 +101,12 @@ class ObservationScaling(nn.Module):
         bounded = half_range.isfinite() & (half_range > 0)
         self.register_buffer("center", torch.where(bounded, low + half_range, 0.0))
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
+
+    def fit(self, observations, ranks):
+        """Leaves as they are the numbers whose bounds are a thousand times beyond all in observations (N, O)."""
+        ranks.average([reach := (observations - self.center).abs().amax(0)])
+        beyond = self.half_range > 1000 * reach
+        self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):
         return (observation - self.center) / self.half_range
@@ -169,12 +173,10 @@ class ReplayBuffer:
         self.sizes = (observation_size, 1, 1, 1, observation_size)
         self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
-        self.largest_reward = -math.inf
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
         """Stores K transitions: (K, O), (K,), (K,), (K,), (K,), (K, O), as numpy arrays, over the oldest when full."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
-        self.largest_reward = max(self.largest_reward, float(rewards.max()))
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
         for row in rows:
             self.rows[self.position].copy_(row)
@@ -187,39 +189,30 @@ class ReplayBuffer:
         observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
 
-    def rewards(self):
-        """All that is stored of these: (size,)."""
-        return self.rows[: self.size].split(self.sizes, dim=1)[2].squeeze(1)
+    def observations_and_rewards(self):
+        """All that is stored of these: (size, O), (size,)."""
+        observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return observations, rewards.squeeze(1)
 
     def state_dict(self):
         """A copy of the filled part, for a checkpoint."""
-        rows = self.rows[: self.size].to("cpu", copy=True)
-        return {"rows": rows, "position": self.position, "largest_reward": self.largest_reward}
+        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position}
 
     def load_state_dict(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
-        self.largest_reward = state["largest_reward"]
         self.rows[: self.size] = state["rows"].to(self.rows.device)
 
 
 # The agent
 
 
-def td_targets(rewards, terminated, next_q, next_actions, gamma, bound=math.inf):
-    """r + γ (1 − terminated) Q_target(s', a'): (B,), with a' the Q-network's own choice (double DQN, arXiv:1509.06461).
-
-    next_q (B, A) from the target network, the rest (B,). No target exceeds `bound`.
-    """
-    next_value = next_q.gather(1, next_actions[:, None]).squeeze(1)
-    return (rewards + gamma * (1 - terminated) * next_value).clamp(max=bound)
+def td_targets(rewards, terminated, next_q, gamma):
+    """r + γ (1 − terminated) max Q(s', ·): (B,), for next_q (B, A) and the rest (B,). Algorithm 1 of Mnih et al."""
+    return rewards + gamma * (1 - terminated) * next_q.amax(1)
 
 
 def action_gap(q, actions):
-    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,).
-
-    Advantage learning (Baird's; arXiv:1512.04860) takes a part of it off the target: the best action keeps its value,
-    and the others' come to lie 1 / (1 − part) times as far below it.
-    """
+    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,). It is 0 for the best action."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
 
@@ -229,23 +222,22 @@ def td_loss(q, targets):
 
 
 class DQNAgent(nn.Module):
-    """The Q-network with its target and optimizer.
+    """The Q-network with its target network and optimizer, and the policy that is evaluated.
 
-    The tutorial's network starts near Q = 0 and climbs to 1 / (1 − γ), a reward at a time, and meanwhile looks no
-    further ahead than it has climbed: it balances the pole and does not see that the cart leaves the track. Here
-    `value_offset`, the worth of an endless episode, is added to the network, which has to learn only what ends it.
+    The policy acts by the target network, a running average of the Q-network: one snapshot of it may fail.
     """
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
         self.config, self.device, self.ranks = config, device, ranks
         self.num_actions = int(action_space.n)
-        self.policy = Policy(config, observation_space, action_space)
-        self.scaling, self.q_network = self.policy.scaling, self.policy.q_network
-        network_arguments = (math.prod(observation_space.shape), self.num_actions, config.layers)
-        self.target_network = QNetwork(*network_arguments).requires_grad_(False)
-        self.target_network.load_state_dict(self.q_network.state_dict())
+        self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
+        self.scaling, self.target_network = self.policy.scaling, self.policy.q_network
+        self.q_network = QNetwork(math.prod(observation_space.shape), self.num_actions, config.layers)
+        self.q_network.load_state_dict(self.target_network.state_dict())
+        # Q = (mean reward + mean |reward| × the network's output) / (1 − γ); as long as nothing is fitted, the output.
         self.register_buffer("value_offset", torch.tensor(0.0))
+        self.register_buffer("value_scale", torch.tensor(1.0))
         self.to(device)
         adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), config.learning_rate, **adam)
@@ -255,50 +247,48 @@ class DQNAgent(nn.Module):
         """Uniform actions (K,), numpy."""
         return torch.randint(self.num_actions, (count,)).numpy()
 
-    def fit_offset(self, rewards):
-        """Fixes the offset of Q from the rewards (N,) of the initial random data of all ranks."""
-        if self.config.value_offset:
-            self.ranks.average([mean := rewards.mean()])
-            self.value_offset += mean / (1 - self.config.gamma)
+    def fit_scaling(self, observations, rewards):
+        """Fixes the scales of observations and values by observations (N, O) and rewards (N,) of all ranks."""
+        if self.config.observation_scaling:
+            self.scaling.fit(observations, self.ranks)
+        if self.config.value_unit:
+            self.ranks.average([mean := rewards.mean(), size := rewards.abs().mean()])
+            self.value_offset.copy_(mean / (1 - self.config.gamma))
+            self.value_scale.copy_(torch.where(size > 0, size, 1.0) / (1 - self.config.gamma))
 
     @torch.no_grad()
     def act(self, observations):
         """Epsilon-greedy actions (K,) for flat observations (K, O), numpy to numpy."""
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
-        greedy = self.policy(observations).cpu().numpy()
+        greedy = self.q_network(self.scaling(observations)).argmax(1).cpu().numpy()
         exploring = (torch.rand(len(greedy)) < self.config.epsilon).numpy()
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
-    def update(self, batch, step, largest_reward):
+    def update(self, batch, step):
         """One gradient step of the Q-network, then of its target, after `step` updates.
 
-        `batch` is what `ReplayBuffer.sample` returns, `largest_reward` the largest ever stored. Returns the scalars to
-        log, as tensors on the device: reading a number back here would make a GPU wait at every step.
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
+        number back here would make a GPU wait at every step.
         """
         config = self.config
-        observations, actions, rewards, terminated, next_observations = batch
-        # A policy that balances sees only states that are worth the same, and the noise of large steps upsets it again.
-        self.optimizer.param_groups[0]["lr"] = config.learning_rate * (1 / (1 + step / config.learning_rate_decay))
-        # Without it errors of extrapolation add up where all states are worth the same: the mean Q grew to twice as much.
-        # Where every reward is a cost, the best that can happen is that the episode ends.
-        bound = max(largest_reward, largest_reward / (1 - config.gamma)) if config.value_bound else math.inf
-
-        both = self.scaling(torch.cat((observations, next_observations)))
-        observations, next_observations = both.chunk(2)
+        s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
+        s, next_s = self.scaling(s), self.scaling(next_s)  # ours
         with torch.no_grad():
-            next_actions = self.q_network(next_observations).argmax(1)
-            target_q, next_q = (config.value_scale * self.target_network(both)).chunk(2)
-            targets = td_targets(rewards, terminated, self.value_offset + next_q, next_actions, config.gamma, bound)
-            targets -= config.advantage_learning * action_gap(target_q, actions)
-        output = self.q_network(observations).gather(1, actions[:, None]).squeeze(1)
-        q = self.value_offset + config.value_scale * output
-        loss = td_loss(q, targets)
+            next_q = self.value_offset + self.value_scale * self.target_network(next_s)  # Q̄(s', ·): (B, A); the unit: ours
+            y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
+            if config.advantage_learning:  # ours: y − part × (max Q̄(s, ·) − Q̄(s, a))
+                y -= config.advantage_learning * self.value_scale * action_gap(self.target_network(s), a)
+        q = self.value_offset + self.value_scale * self.q_network(s)  # Q(s, ·): (B, A)
+        q = q.gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
+        loss = td_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
         loss.backward()
         self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])
+        if config.learning_rate_decay:  # ours
+            self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + step / config.learning_rate_decay)
         self.optimizer.step()
 
-        with torch.no_grad():
+        with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄); τ: ours
             for target, parameter in zip(self.target_network.parameters(), self.q_network.parameters()):
                 target.lerp_(parameter, config.target_update_tau)
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
@@ -363,13 +353,13 @@ def train(config):
                 buffer.add(*envs.step_wait())
                 env_steps += config.num_envs * run.ranks.world_size
             if env_steps >= due and not warming_up:
-                metrics = agent.update(buffer.sample(batch_size), step, buffer.largest_reward)
+                metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
                 run.progress.update()
                 if step % config.log_interval == 0:
                     run.log_training(step, env_steps, envs, metrics)
             if warming_up and env_steps >= config.initial_collect_steps:
-                agent.fit_offset(buffer.rewards())
+                agent.fit_scaling(*buffer.observations_and_rewards())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
