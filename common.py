@@ -227,7 +227,7 @@ def find_task(config, action_space):
     or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
     """
     name = f"--env-id {config.env_id}"
-    if config.env_id.count(":") > 1 or config.env_id.startswith("."):
+    if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
         raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
