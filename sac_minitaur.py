@@ -203,8 +203,8 @@ class Policy(nn.Module):
 
 
 def to_bounds(action, low, high):
-    """Maps an action from [-1, 1] to [low, high], of which rounding could miss the ends."""
-    return ((low + high) / 2 + (high - low) / 2 * action).clip(low, high)
+    """Maps an action from [-1, 1] to [low, high]: rounding could miss the ends, and a sum of the two overflow."""
+    return (low / 2 + high / 2 + (high / 2 - low / 2) * action).clip(low, high)
 
 
 def require_finite(actions):
