@@ -323,7 +323,8 @@ class Environments:
         def make(i, episode, actions, total):
             if os.getpid() != main:
                 start_worker()
-            return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, map(np.array, actions), total)
+            with telling_task_errors():
+                return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions), total)
 
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv

@@ -165,6 +165,19 @@ def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypat
         main(monkeypatch, "--env-id", "Mine-v0")
 
 
+def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
+    once = iter([Echo()])
+
+    def make():
+        for env in once:
+            return env
+        raise ConnectionError("no second server")
+
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
+    with pytest.raises(common.TaskError, match="in make\n(.|\n)*no second server"):
+        train(tmp_path / "run", **SHORT, env_id="Mine-v0")
+
+
 def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, capsys):
     choices = dict(critic_learning_rate=np.float64(1e-3), seed=np.int64(3), actor_layers=[16], num_envs=np.int32(1))
     config = Config(**TINY | SHORT | IDS | choices, run_dir=tmp_path / "run")
