@@ -8,6 +8,7 @@ import contextlib
 import copy
 import csv
 import ctypes
+import dataclasses
 import errno
 import io
 import json
@@ -231,7 +232,10 @@ def find_task(config, action_space):
         raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
-            task, observations, actions = env.spec, env.observation_space, env.action_space
+            observations, actions = env.observation_space, env.action_space
+            limit = env.spec.max_episode_steps or 10_000  # or an evaluation might never end
+            # Not env.spec: it has wrappers of the task's own too, which gymnasium cannot always compare with new ones.
+            task = dataclasses.replace(gym.registry[env.spec.id], max_episode_steps=limit)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     if not isinstance(observations, gym.spaces.Box) or not observations.shape:
@@ -245,7 +249,6 @@ def find_task(config, action_space):
         fits = (np.isfinite(width) & (width > 0)).all()
     if not fits:
         raise InputError(f"{name} has the action space {actions}: this algorithm needs a {needed}")
-    task.max_episode_steps = task.max_episode_steps or 10_000  # or an evaluation might never end
     return task, observations, actions
 
 

@@ -16,6 +16,7 @@ import sac_minitaur
 from sac_minitaur import Config, Policy
 from test_sac import TINY, load_policy, main, read_checkpoint, read_csv, train
 
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:gymnasium")  # what it says of such tasks
 SHORT = dict(initial_collect_steps=40, num_iterations=20, replay_buffer_capacity=60, n_step=1, log_interval=20)
 
 
@@ -146,6 +147,19 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
     assert common.find_task(Config(env_id="Pendulum-v1", max_episode_steps=300), gym.spaces.Box)[0].max_episode_steps == 300
 
 
+def test_a_task_that_wraps_another(monkeypatch):
+    """With a function, which gymnasium finds unequal to its like in the spec of an environment made before."""
+
+    def make():
+        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, gym.spaces.Box(-99, 99, (3,)))
+
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
+    task, observation_space, _ = common.find_task(Config(env_id="Mine-v0"), gym.spaces.Box)
+    assert task.max_episode_steps == 200 and observation_space.high[0] == 99  # the limit of the one that is wrapped
+    with gym.make(task) as env:
+        assert env.observation_space == observation_space
+
+
 @pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7)])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
 def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path):
@@ -190,11 +204,11 @@ def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, ca
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MinitaurBulletEnv-v0"])
-@pytest.mark.parametrize("rate", ["actor_learning_rate", "critic_learning_rate"])
-def test_a_diverged_actor_ends_the_run_in_one_line(env_id, rate, tmp_path):
+@pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
+def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
     if env_id != "Pendulum-v1":
         pytest.importorskip("pybullet")
-    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20, rate: 1e30}
+    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20} | fault
     with pytest.raises(common.RunError, match="not finite") as caught:
         train(tmp_path / "run", **choices, env_id=env_id)
     assert len(str(caught.value).splitlines()) == 1
