@@ -259,8 +259,8 @@ def telling_task_errors():
         yield
     except RunError:
         raise
-    except Exception:
-        raise TaskError(f"the task failed\n{traceback.format_exc()}") from None
+    except Exception as error:
+        raise TaskError(f"the task failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
 def start_worker():
@@ -336,10 +336,10 @@ class Environments:
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
 
     def reset(self):
-        """Brings each to where its episode stands. Returns whether all episodes could be played again."""
+        """Brings each to where its episode stands. `lost` (K,) tells where that had to be a new episode."""
         self.observations, infos = self.vector.reset()
-        self.num_episodes += infos.get("_not_repeatable", np.array(False))
-        return "not_repeatable" not in infos
+        self.lost = infos.get("_not_repeatable", np.zeros(len(self.num_episodes), bool))
+        self.num_episodes += self.lost
 
     def step_async(self, actions):
         """Starts a step with actions (K, …)."""
@@ -548,7 +548,7 @@ class Run:
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and "cuda" in own["random"]:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
-        repeated = environments.reset()
+        environments.reset()
         if self.writes:
             self._start_files()
         bar = self.writes and getattr(sys.stderr, "isatty", bool)()
@@ -558,7 +558,7 @@ class Run:
         self.print(f"{config.env_id}, at most {self.task.max_episode_steps} steps an episode (--max-episode-steps)")
         self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full; run directory {self.path}")
-        if not repeated:
+        if environments.lost.any():
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)
 
@@ -751,8 +751,11 @@ def evaluate_policy(config, script, policy, task, evaluate):
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None)])
     print(f"{config.evaluate}: {text}")
     if config.video:
-        film(policy, task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
-        print(f"filmed one episode: {path}")
+        try:
+            film(policy, task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
+            print(f"filmed one episode: {path}")
+        except Exception as error:
+            print(f"warning: no video ({first_line(error)})")
 
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):

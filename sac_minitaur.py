@@ -497,6 +497,8 @@ def train(config):
         )  # fmt: skip
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
         step, env_steps = run.start(agent, buffer, envs)
+        for k in np.flatnonzero(envs.lost):
+            buffer.incomplete[k].clear()  # the steps that should complete these will not come
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)
         run.evaluate(0, 0, policy=None)

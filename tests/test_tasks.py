@@ -50,6 +50,16 @@ class Echo(gym.Env):
         return self.state if self.in_place else self.state.copy()
 
 
+class Unrepeatable(Echo):
+    """Its episodes end when something outside says so, which is not the same on resume."""
+
+    length = 50
+
+    def step(self, action):
+        observation, reward, *_ = super().step(action)
+        return observation, reward, bool(self.state[0] >= self.length), False, {}
+
+
 class TwoArguments(Exception):
     """It cannot be made anew from its message, as pickle would."""
 
@@ -59,6 +69,7 @@ class TwoArguments(Exception):
 
 gym.register("Echo-v0", entry_point=Echo, max_episode_steps=4)
 gym.register("Endless-v0", entry_point=Echo)
+gym.register("Unrepeatable-v0", entry_point=Unrepeatable, max_episode_steps=100)
 IDS = {"env_id": f"{__name__}:Echo-v0"}
 
 
@@ -94,8 +105,10 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
     env_id = register(dtype=dtype, low=low, high=high)
     path, _ = train(tmp_path / "run", **SHORT, env_id=env_id)
     capsys.readouterr()
-    assert main(monkeypatch, "--evaluate", path / "policy.pt", "--no-video") == 0
-    assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in capsys.readouterr().out
+    assert main(monkeypatch, "--evaluate", path / "policy.pt", "--video") == 0
+    output = capsys.readouterr().out
+    assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
+    assert "warning: no video (Echo.__init__() got an unexpected keyword argument 'render_mode'" in output
     observations = torch.rand(5, 2)
     exported = torch.export.load(path / "policy.pt2").module()(observations)
     assert torch.equal(exported, load_policy(path)(observations))
@@ -201,6 +214,17 @@ def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, ca
     assert read_checkpoint(path)[0]["config"]["seed"] == 3
     again = Config(**TINY | SHORT | IDS | choices | {"num_iterations": 30}, resume=str(path))
     assert sac_minitaur.train(again) == path and read_checkpoint(path)[0]["step"] == 30
+
+
+def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path, capsys):
+    choices = SHORT | dict(env_id=f"{__name__}:Unrepeatable-v0", n_step=3, replay_buffer_capacity=200)
+    train(tmp_path / "run", **choices)
+    assert "warning" not in capsys.readouterr().out
+    monkeypatch.setattr(Unrepeatable, "length", 5)
+    train(tmp_path / "run", **choices | {"num_iterations": 40}, run_dir=None, resume=str(tmp_path / "run"))
+    assert "warning: an episode went differently" in capsys.readouterr().out
+    rows = read_checkpoint(tmp_path / "run")[1]["buffer"]["rows"]
+    assert len(rows) == 40 + 40 - 2 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MinitaurBulletEnv-v0"])
