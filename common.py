@@ -102,8 +102,8 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
 
 def with_tutorial_values(given, tutorial):
     """What `Config` is given, with the `tutorial`'s values for what is not given where `tutorial` is."""
-    values = given.kwargs or {} if isinstance(given, ArgsKwargs) else given
-    return tutorial | values if values.get("tutorial") else given
+    values = given.kwargs or {}
+    return ArgsKwargs(given.args, tutorial | values) if values.get("tutorial") else given
 
 
 def read_command_line(config_class, description, script):

@@ -90,7 +90,9 @@ def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
     path, _ = train(tmp_path / "run", **SHORT, env_id=register(high=high, in_place=True), num_envs=2)
     own = read_checkpoint(path)[1]
     observations, actions, rewards, _, next_observations = own["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
-    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1) and torch.equal(rewards, next_observations[:, :1])
+    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1) and torch.equal(
+        rewards, next_observations[:, :1]
+    )
     assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
     torch.testing.assert_close(next_observations[:, 1:], actions if high == 1 else 1 + 2 * actions)
     # Those of the running episodes, to be played again on resume.
@@ -114,7 +116,9 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
     assert torch.equal(exported, load_policy(path)(observations))
 
 
-@pytest.mark.parametrize("dtype, scale", [(np.float32, 10), (np.float32, 1.7e38), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)])
+@pytest.mark.parametrize(
+    "dtype, scale", [(np.float32, 10), (np.float32, 1.7e38), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)]
+)
 def test_actions_never_leave_the_bounds(dtype, scale):
     random = np.random.default_rng(0)
     low, high = np.sort(random.uniform(-scale, scale, (2, 300)).astype(dtype), axis=0)
@@ -157,7 +161,9 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
     assert "at most 7 steps an episode (--max-episode-steps)" in capsys.readouterr().out
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
     assert common.find_task(Config(env_id="Pendulum-v1"), gym.spaces.Box)[0].max_episode_steps == 200
-    assert common.find_task(Config(env_id="Pendulum-v1", max_episode_steps=300), gym.spaces.Box)[0].max_episode_steps == 300
+    assert (
+        common.find_task(Config(env_id="Pendulum-v1", max_episode_steps=300), gym.spaces.Box)[0].max_episode_steps == 300
+    )
 
 
 def test_a_task_that_wraps_another(monkeypatch):
