@@ -8,6 +8,7 @@ import contextlib
 import copy
 import csv
 import ctypes
+import dataclasses
 import errno
 import io
 import json
@@ -101,8 +102,8 @@ Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
 
 def with_tutorial_values(given, tutorial):
     """What `Config` is given, with the `tutorial`'s values for what is not given where `tutorial` is."""
-    values = given.kwargs or {} if isinstance(given, ArgsKwargs) else given
-    return tutorial | values if values.get("tutorial") else given
+    values = given.kwargs or {}
+    return ArgsKwargs(given.args, tutorial | values) if values.get("tutorial") else given
 
 
 def read_command_line(config_class, description, script):
@@ -227,11 +228,14 @@ def find_task(config, action_space):
     or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
     """
     name = f"--env-id {config.env_id}"
-    if config.env_id.count(":") > 1 or config.env_id.startswith("."):
+    if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
         raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
-            task, observations, actions = env.spec, env.observation_space, env.action_space
+            observations, actions = env.observation_space, env.action_space
+            limit = env.spec.max_episode_steps or 10_000  # or an evaluation might never end
+            # Not env.spec: it has wrappers of the task's own too, which gymnasium cannot always compare with new ones.
+            task = dataclasses.replace(gym.registry[env.spec.id], max_episode_steps=limit)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     if not isinstance(observations, gym.spaces.Box) or not observations.shape:
@@ -245,7 +249,6 @@ def find_task(config, action_space):
         fits = (np.isfinite(width) & (width > 0)).all()
     if not fits:
         raise InputError(f"{name} has the action space {actions}: this algorithm needs a {needed}")
-    task.max_episode_steps = task.max_episode_steps or 10_000  # or an evaluation might never end
     return task, observations, actions
 
 
@@ -256,8 +259,8 @@ def telling_task_errors():
         yield
     except RunError:
         raise
-    except Exception:
-        raise TaskError(f"the task failed\n{traceback.format_exc()}") from None
+    except Exception as error:
+        raise TaskError(f"the task failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
 def start_worker():
@@ -323,7 +326,8 @@ class Environments:
         def make(i, episode, actions, total):
             if os.getpid() != main:
                 start_worker()
-            return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, map(np.array, actions), total)
+            with telling_task_errors():
+                return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions), total)
 
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
@@ -332,10 +336,10 @@ class Environments:
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
 
     def reset(self):
-        """Brings each to where its episode stands. Returns whether all episodes could be played again."""
+        """Brings each to where its episode stands. `lost` (K,) tells where that had to be a new episode."""
         self.observations, infos = self.vector.reset()
-        self.num_episodes += infos.get("_not_repeatable", np.array(False))
-        return "not_repeatable" not in infos
+        self.lost = infos.get("_not_repeatable", np.zeros(len(self.num_episodes), bool))
+        self.num_episodes += self.lost
 
     def step_async(self, actions):
         """Starts a step with actions (K, …)."""
@@ -545,7 +549,7 @@ class Run:
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and "cuda" in own["random"]:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
-        repeated = environments.reset()
+        environments.reset()
         if self.writes:
             self._start_files()
         bar = self.writes and getattr(sys.stderr, "isatty", bool)()
@@ -555,7 +559,7 @@ class Run:
         self.print(f"{config.env_id}, at most {self.task.max_episode_steps} steps an episode (--max-episode-steps)")
         self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full; run directory {self.path}")
-        if not repeated:
+        if environments.lost.any():
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)
 
@@ -700,9 +704,9 @@ class Run:
             return
         self.progress.close()
         title = f"{self.config.env_id}, seed {self.config.seed}"
-        with self._or_warn("learning_curve.png"):
+        with or_warn("learning_curve.png", self.print):
             plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
-        if self.stopped:
+        if self.stopped or self.stopping:  # the latter in the last evaluation, which is then still to be done
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:
@@ -714,24 +718,26 @@ class Run:
             films["learning.mp4"] = self._film(learning, "learning.mp4", captions, 4, 25)
             films["trained_agent.mp4"] = self._film([policy], "trained_agent.mp4")
             films["random_agent.mp4"] = self._film([None], "random_agent.mp4")
-        with self._or_warn("exported policy"):
+        with or_warn("exported policy", self.print):
             export_policy(self.path / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.best["weights"])
             export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
-            with self._or_warn(name):
+            with or_warn(name, self.print):
                 while not self.stopping and not recording.done():
                     time.sleep(0.1)
                 recording.result(timeout=0)
         files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
         self.print(f"finished; {self.path} holds {files}")
 
-    @contextlib.contextmanager
-    def _or_warn(self, what):
-        try:
-            yield
-        except Exception as error:
-            self.print(f"warning: no {what} ({first_line(error)})")
+
+@contextlib.contextmanager
+def or_warn(what, say):
+    """Makes a failure of what is nice to have cost a line."""
+    try:
+        yield
+    except Exception as error:
+        say(f"warning: no {what} ({first_line(error)})")
 
 
 def evaluation_seeds(config):
@@ -759,8 +765,9 @@ def evaluate_policy(config, script, policy, task, evaluate):
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None)])
     print(f"{config.evaluate}: {text}")
     if config.video:
-        film([policy], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
-        print(f"filmed one episode: {path}")
+        with or_warn("video", print):
+            film([policy], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
+            print(f"filmed one episode: {path}")
 
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):

@@ -203,8 +203,8 @@ class Policy(nn.Module):
 
 
 def to_bounds(action, low, high):
-    """Maps an action from [-1, 1] to [low, high], of which rounding could miss the ends."""
-    return ((low + high) / 2 + (high - low) / 2 * action).clip(low, high)
+    """Maps an action from [-1, 1] to [low, high]: rounding could miss the ends, and a sum of the two overflow."""
+    return (low / 2 + high / 2 + (high / 2 - low / 2) * action).clip(low, high)
 
 
 def require_finite(actions):
@@ -497,6 +497,8 @@ def train(config):
         )  # fmt: skip
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
         step, env_steps = run.start(agent, buffer, envs)
+        for k in np.flatnonzero(envs.lost):
+            buffer.incomplete[k].clear()  # the steps that should complete these will not come
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)
         run.evaluate(0, 0, policy=None)

@@ -312,8 +312,8 @@ def test_dynamics_can_be_given(env):
 
 
 def test_what_only_critics_see_is_all_that_training_adds(env):
-    assert sac_minitaur.make_training_env(ENV_ID, privileged=False).observation_space == env.observation_space
-    with contextlib.closing(sac_minitaur.make_training_env(ENV_ID, privileged=True)) as training_env:
+    assert sac_minitaur.make_training_env(env.spec, privileged=False).observation_space == env.observation_space
+    with contextlib.closing(sac_minitaur.make_training_env(env.spec, privileged=True)) as training_env:
         assert training_env.observation_space.shape == (28 + 7,)
         observation, _ = env.reset(seed=3)
         extended, _ = training_env.reset(seed=3)
@@ -428,13 +428,15 @@ class Block:
             raise ImportError("No module named " + name)
 
 sys.meta_path.insert(0, Block())
-import sac_minitaur
-env = sac_minitaur.make_training_env("Pendulum-v1", privileged=True)
+import gymnasium as gym
+import common, sac_minitaur
+task, *_ = common.find_task(sac_minitaur.Config(env_id="Pendulum-v1"), gym.spaces.Box)
+env = sac_minitaur.make_training_env(task, privileged=True)
 env.reset(seed=0)
 env.step(env.action_space.sample())
 try:
-    sac_minitaur.make_env("{ENV_ID}")
-except sac_minitaur.InputError as error:
+    common.find_task(sac_minitaur.Config(), gym.spaces.Box)
+except common.InputError as error:
     print(error)
 """
     process = run_python(code, tmp_path)

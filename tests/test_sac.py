@@ -5,6 +5,7 @@ import csv
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-import tyro
+from pydantic import ValidationError
 from torch import nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
@@ -23,20 +24,12 @@ import sac_minitaur
 from sac_minitaur import Actor, Config, ObservationScaling, Policy, ReplayBuffer, SACAgent
 
 ROOT = Path(__file__).parent.parent
+# The tutorials' values, here written down a second time.
 TUTORIALS = dict(
-    privileged_critics=False,
-    observation_scaling=False,
-    reward_scaling=False,
-    critic_batch_norm=False,
-    adam_beta1=0.9,
-    n_step=1,
-    averaged_actor_tau=1.0,
-    mean_action_episodes=False,
-    initial_log_alpha=0,
-    target_entropy_per_action=-0.5,
-    reward_scale_factor=1,
-    replay_buffer_capacity=10_000,
-)
+    adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, n_step=1, reward_scaling=False,
+    reward_scale_factor=1, averaged_actor_tau=1, mean_action_episodes=False, target_entropy_per_action=-0.5,
+    initial_log_alpha=0, observation_scaling=False, replay_buffer_capacity=10_000,
+)  # fmt: skip
 
 
 def make_agent(observation_size=3, action_size=2, device="cpu", state_size=None, **choices):
@@ -44,7 +37,8 @@ def make_agent(observation_size=3, action_size=2, device="cpu", state_size=None,
     config = Config(**{"actor_layers": (16, 16), "critic_layers": (16, 16)} | choices)
     observation_space = gym.spaces.Box(-np.inf, np.inf, (observation_size,))
     action_space = gym.spaces.Box(-1, 1, (action_size,))
-    return SACAgent(config, observation_space, action_space, torch.device(device), common.Ranks(), state_size)
+    state_size = state_size or observation_size
+    return SACAgent(config, observation_space, action_space, state_size, torch.device(device), common.Ranks())
 
 
 def make_batch(size=32, observation_size=3, action_size=2):
@@ -133,7 +127,7 @@ def test_actor_log_probabilities_where_tanh_saturates(mean):
     noise = torch.randn(5, 2).double()
     log_std = torch.tensor([-20.0, 2.0], dtype=torch.float64)  # the bounds that ±100 are clamped to
     u = mean + log_std.exp() * noise
-    log_normal = -noise**2 / 2 - log_std - math.log(2 * math.pi) / 2
+    log_normal = -(noise**2) / 2 - log_std - math.log(2 * math.pi) / 2
     log_determinant = math.log(4) - 2 * u.abs() - 2 * torch.log1p((-2 * u.abs()).exp())  # log(1 − tanh²u)
     torch.testing.assert_close(log_probs.double(), (log_normal - log_determinant).sum(1), rtol=1e-5, atol=1e-4)
     (log_probs.sum() + actions.sum()).backward()
@@ -150,13 +144,11 @@ def test_networks_start_glorot_uniform():
         assert layer.weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.1)
 
 
-def test_batch_norm_takes_the_batch_and_remembers_a_hundredth_of_it():
-    norm = sac_minitaur.BatchNorm(2, common.Ranks())
-    x = torch.tensor([[1.0, 10.0], [3.0, 30.0]])
-    normalized = 1 / math.sqrt(1 + 1e-3), 10 / math.sqrt(100 + 1e-3)
-    torch.testing.assert_close(norm(x), torch.tensor([[-1.0], [1.0]]) * torch.tensor(normalized))
-    mean, variance = torch.tensor([0.02, 0.2]), torch.tensor([0.99 + 0.02, 0.99 + 2])  # of a population of two
-    torch.testing.assert_close(norm.eval()(x), (x - mean) / (variance + 1e-3).sqrt())
+def test_critics_normalize_the_inputs_of_their_layers():
+    critics = make_agent().critics
+    norms = [module for module in critics.modules() if isinstance(module, nn.BatchNorm1d)]
+    assert [norm.num_features for norm in norms] == 2 * [3 + 2, 16, 16]
+    assert {(norm.momentum, norm.eps) for norm in norms} == {(0.01, 1e-3)}  # CrossQ's
 
 
 def test_twin_critics_are_independent():
@@ -180,8 +172,6 @@ def test_observation_scaling():
     # The third never moved; its spread counts as 0.01.
     near = scaling(torch.tensor([[2.0, 20.0, 7.02]]))
     torch.testing.assert_close(near, torch.tensor([[0.0, 0.0, 2.0]]), atol=1e-3, rtol=0)
-    # Without what only the critics see.
-    assert torch.equal(scaling(observations[:, :2]), scaling(observations)[:, :2])
     other = ObservationScaling(3)
     other.load_state_dict(scaling.state_dict())
     assert torch.equal(other(far), scaling(far))
@@ -189,19 +179,16 @@ def test_observation_scaling():
 
 def test_policy_acts_with_the_mean_in_the_tasks_units():
     action_space = gym.spaces.Box(np.float32([[0, -3], [-1, 5]]), np.float32([[10, 1], [1, 6]]))
-    scaling, actor = ObservationScaling(6), Actor(6, 4, (16,))
+    policy = Policy(Config(actor_layers=(16,)), gym.spaces.Box(-1, 1, (2, 3)), action_space)
+    scaling, actor = policy.scaling, policy.actor
     scaling.fit(torch.randn(100, 6), common.Ranks())
-    policy = Policy(scaling, actor, action_space)
     observations = torch.randn(5, 2, 3)
     actions = policy(observations)
     mean, _ = actor(scaling(observations.flatten(1)))
     squashed = mean.tanh().view(5, 2, 2)
     expected = torch.tensor([[5.0, -1.0], [0.0, 5.5]]) + torch.tensor([[5.0, 2.0], [1.0, 0.5]]) * squashed
     torch.testing.assert_close(actions, expected)
-    # It is what the training environment does with the agent's actions.
-    rescale = gym.wrappers.RescaleAction(StepCounter(action_space), np.float32(-1), np.float32(1))
-    for action, own in zip(actions, squashed):
-        np.testing.assert_allclose(rescale.action(own.detach().numpy()), action.detach().numpy(), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(policy.act(observations[0].numpy()), expected[0].detach(), rtol=1e-5, atol=1e-6)
     with torch.no_grad():
         actor.net[-1].bias[:4] = 100
     assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
@@ -284,8 +271,8 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
 def test_replay_buffer_goes_on_from_its_state(stored, position):
     buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
     other = ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU)
-    state = buffer.state()
-    other.load_state(state)
+    state = buffer.state_dict()
+    other.load_state_dict(state)
     for each in (buffer, other):
         filled(each, stored, 4)
     assert torch.equal(other.rows, buffer.rows) and buffer.size == other.size == 5
@@ -308,11 +295,11 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     actions, returns, discounts = batch[1], agent.reward_scale * batch[2], batch[3]
     alpha = agent.log_alpha.exp().item()
     with torch.no_grad():
-        followers = (agent.averaged_actor,) if batch_norm else (agent.averaged_actor, agent.target_critics)
+        followers = (agent.policy.actor,) if batch_norm else (agent.policy.actor, agent.target_critics)
         for parameter in nn.ModuleList(followers).parameters():  # else they would equal what they follow
             parameter += 0.05 * torch.randn_like(parameter)
     actor, critics, target_critics = (copy.deepcopy(m) for m in (agent.actor, agent.critics, agent.target_critics))
-    averaged = [parameter.clone() for parameter in agent.averaged_actor.parameters()]
+    averaged = [parameter.clone() for parameter in agent.policy.actor.parameters()]
 
     def adam_step(parameters, gradients, learning_rate):
         with torch.no_grad():
@@ -355,7 +342,7 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     assert agent.log_alpha.item() == pytest.approx(config.initial_log_alpha + step, abs=1e-6)
     assert metrics["alpha"].item() == pytest.approx(alpha)
 
-    for own, before, mine in zip(agent.averaged_actor.parameters(), averaged, agent.actor.parameters()):
+    for own, before, mine in zip(agent.policy.actor.parameters(), averaged, agent.actor.parameters()):
         torch.testing.assert_close(own, before + config.averaged_actor_tau * (mine - before), rtol=0, atol=1e-7)
         assert not torch.equal(own, before)
     if batch_norm:
@@ -422,7 +409,7 @@ def test_fit_scaling():
     agent.fit_scaling(observations, torch.tensor([-0.001, 0.005]))  # about as much as the Minitaur's
     assert agent.reward_scale.item() == pytest.approx(6 / 0.003)
     assert agent.scaling.mean.tolist() == [2, 20, 7]
-    assert agent.policy.scaling is agent.scaling  # so it is evaluated and exported with the policy
+    assert agent.policy.scaling.mean.tolist() == [2, 20, 7]  # it is evaluated and exported with the policy
 
 
 @pytest.mark.parametrize("reward", [0.0, 0.1, 1.0])
@@ -443,11 +430,24 @@ def test_the_tutorials_values_are_the_defaults():
     assert config.checkpoint_interval == 5_000 and config.critic_loss_weight == 0.5
 
 
-def test_the_tutorials_exact_choices_are_flags():
-    flags = """--no-privileged-critics --no-observation-scaling --no-reward-scaling --reward-scale-factor 1 --no-critic-batch-norm
-        --adam-beta1 0.9 --n-step 1 --averaged-actor-tau 1 --no-mean-action-episodes --initial-log-alpha 0
-        --target-entropy-per-action -0.5 --replay-buffer-capacity 10000"""
-    assert tyro.cli(Config, args=flags.split()) == Config(**TUTORIALS)
+def test_tutorial_sets_every_value_that_is_ours_to_theirs():
+    lines = Path(sac_minitaur.__file__).read_text().splitlines()
+    ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
+    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours | {"replay_buffer_capacity"} and len(ours) == 11
+    assert Config(tutorial=True) == Config(**TUTORIALS, tutorial=True)
+    assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
+
+
+def test_flags_beside_tutorial_still_count(monkeypatch):
+    monkeypatch.setattr(sys, "argv", "sac_minitaur.py --tutorial --n-step 3 --reward-scaling".split())
+    config = common.read_command_line(Config, "", "sac_minitaur")
+    assert config == Config(**TUTORIALS | {"n_step": 3, "reward_scaling": True}, tutorial=True)
+    assert Config("Pendulum-v1", tutorial=True, n_step=3) == Config(
+        "Pendulum-v1", **TUTORIALS | {"n_step": 3}, tutorial=True
+    )
+
+
+def test_the_tutorials_agent():
     agent = make_agent(**TUTORIALS)
     observations = 100 * torch.randn(50, 3)
     agent.fit_scaling(observations, 7 * torch.randn(50))
@@ -476,7 +476,7 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
     generator = torch.Generator().manual_seed(3)
     noise = [torch.randn(32, 2, generator=generator) for _ in range(2)]
     agents = [make_agent(device=device, state_size=5, **choices | {"adam_epsilon": 1e-2}) for device in ("cpu", "cuda")]
-    agents[1].load_state(agents[0].state())  # each device has a generator of its own
+    agents[1].load_state_dict(agents[0].state_dict())  # each device has a generator of its own
     results = []
     for agent in agents:
         draws = iter(noise)
@@ -484,13 +484,7 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
         batch = tuple(tensor.to(agent.device) for tensor in make_batch(observation_size=5))
         agent.fit_scaling(batch[0], batch[2])
         metrics = agent.update(batch)
-        state = agent.state()
-        results.append({name: value.cpu() for name, value in metrics.items()})
-        results[-1] |= {
-            f"{name}.{key}": value.cpu()
-            for name in ("actor", "averaged_actor", "critics", "target_critics")
-            for key, value in state.get(name, {}).items()
-        }
+        results.append({name: value.cpu() for name, value in (metrics | agent.state_dict()).items()})
     torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)
 
 
@@ -576,8 +570,17 @@ def read_csv(path):
 
 
 def read_checkpoint(path):
-    state = torch.load(path / "checkpoint.pt", weights_only=True)
-    return state["shared"], state["ranks"][0]
+    state = common.read_file(path / "checkpoint.pt", "checkpoint", "sac_minitaur")
+    return state, state["ranks"][0]
+
+
+def load_policy(path):
+    """The policy that `--evaluate` reads."""
+    saved = common.read_file(path / "policy.pt", "policy", "sac_minitaur")
+    config = Config(**saved["config"])
+    policy = Policy(config, *common.find_task(config, gym.spaces.Box)[1:])
+    policy.load_state_dict(saved["weights"])
+    return policy
 
 
 @pytest.fixture(scope="module")
@@ -594,8 +597,10 @@ def test_train_does_what_the_config_says(tiny_run):
     shared, own = read_checkpoint(path)
     assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) + 2 == 250 + 60
     assert json.loads((path / "config.json").read_text())["num_iterations"] == 60
-    files = {"config.json", "train.csv", "eval.csv", "random.csv", "learning_curve.png", "checkpoint.pt", "policy.pt2"}
-    assert files | {"best_policy.pt2"} <= {file.name for file in path.iterdir()}
+    files = {"config.json", "train.csv", "eval.csv", "random.csv", "learning_curve.png", "checkpoint.pt"}
+    assert files | {"policy.pt", "policy.pt2", "best_policy.pt", "best_policy.pt2"} <= {
+        file.name for file in path.iterdir()
+    }
     assert list(path.glob("events.out.tfevents.*"))
     assert (path / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
@@ -617,13 +622,12 @@ def test_train_writes_its_rows(tiny_run):
     assert rows[-1]["collect_episode_length"] == 200  # the one episode that ended is the random one
 
 
-def test_of_collected_episodes_the_last_ten_are_reported():
-    episodes = common.Episodes(num_envs=1, seed=0)
-    assert math.isnan(episodes.recent()["collect_return"])
-    for episode in range(12):
-        for i in range(episode + 1):  # returns and lengths 1 to 12
-            episodes.record(np.zeros((1, 1)), np.ones(1), np.array([i == episode]))
-    assert episodes.recent() == {"collect_return": 7.5, "collect_episode_length": 7.5}
+def test_of_collected_episodes_the_last_ten_are_reported(tmp_path):
+    choices = dict(env_id=f"{__name__}:Truncated-v0", initial_collect_steps=40, num_iterations=20, log_interval=20)
+    path, _ = train(tmp_path / "run", **choices, n_step=1)
+    assert read_checkpoint(path)[1]["environments"]["finished"] == 10 * [(1.0 + 2 + 3 + 4, 4)]  # of fifteen
+    row = read_csv(path / "train.csv")[0]
+    assert (row["collect_return"], row["collect_episode_length"]) == (10, 4)
 
 
 def test_train_moves_every_parameter(tiny_run):
@@ -632,12 +636,12 @@ def test_train_moves_every_parameter(tiny_run):
     torch.manual_seed(config.seed)
     with gym.make("Pendulum-v1") as env:
         spaces = env.observation_space, env.action_space
-    untrained = SACAgent(config, *spaces, torch.device("cpu"), common.Ranks()).state()
+    untrained = SACAgent(config, *spaces, 3, torch.device("cpu"), common.Ranks()).state_dict()
     trained = read_checkpoint(path)[0]["agent"]
-    for name in ("actor", "averaged_actor", "critics", "scaling"):
-        assert trained[name].keys() == untrained[name].keys()
-        for key, value in trained[name].items():
-            assert not torch.equal(value, untrained[name][key]) and value.isfinite().all(), (name, key)
+    assert trained.keys() == untrained.keys()
+    for key, value in trained.items():
+        if not key.endswith(("policy.low", "policy.high")):
+            assert not torch.equal(value, untrained[key]) and value.isfinite().all(), key
     # 60 steps of Adam, each of about the learning rate.
     assert 0 < abs(trained["log_alpha"].item() - config.initial_log_alpha) <= 60 * config.alpha_learning_rate * 1.1
 
@@ -670,7 +674,7 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
         assert same(a, b)
     other, _ = train(tmp_path / "other", seed=1)
     agent, own, tables = comparable(other)
-    assert not same(agent["actor"], comparable(path)[0]["actor"])
+    assert not same(agent["actor.net.0.weight"], comparable(path)[0]["actor.net.0.weight"])
     assert not same(own["buffer"], comparable(path)[1]["buffer"])
     assert tables["eval"][0]["average_return"] != comparable(path)[2]["eval"][0]["average_return"]
 
@@ -718,7 +722,9 @@ def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
     assert observations[:, 1].unique().tolist() == [0, 1, 2, 3]
     assert torch.equal(rewards, next_observations[:, 1:])  # unscaled, as the environment gave them
     ended = next_observations[:, 1:] == 4
-    torch.testing.assert_close(discounts, 0.99 * ~ended if env_id == "Terminated-v0" else torch.full_like(discounts, 0.99))
+    torch.testing.assert_close(
+        discounts, 0.99 * ~ended if env_id == "Terminated-v0" else torch.full_like(discounts, 0.99)
+    )
     assert actions.abs().max() <= 1 and len(actions[:40].unique()) == 40
     # Every environment's episodes follow each other.
     for i in range(num_envs):
@@ -737,14 +743,11 @@ def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path, p
     if privileged:  # of the step that each observation is of, to the very end of an episode
         assert torch.equal(observations[:, 2], 100 + observations[:, 1])
         assert torch.equal(next_observations[:, 2], 100 + next_observations[:, 1])
-    assert shared["agent"]["critics"]["q1.1.weight"].shape == (16, size + 1)
-    assert shared["agent"]["actor"]["net.0.weight"].shape == (16, 2)
+    assert shared["agent"]["critics.q1.1.weight"].shape == (16, size + 1)
+    assert shared["agent"]["actor.net.0.weight"].shape == (16, 2)
     observations = torch.rand(5, 2)
     exported = torch.export.load(path / "policy.pt2").module()(observations)
-    with sac_minitaur.make_env(f"{__name__}:Telling-v0") as env:  # as `--evaluate` reads it
-        weights = common.load_weights(path / "policy.pt2")
-        policy = sac_minitaur.make_policy(weights, env.observation_space, env.action_space)
-    assert exported.shape == (5, 1) and torch.equal(policy(observations), exported)
+    assert exported.shape == (5, 1) and torch.equal(load_policy(path)(observations), exported)
 
 
 # Exported policies
@@ -765,11 +768,10 @@ assert not {"sac_minitaur", "common", "gymnasium"} & set(sys.modules)
     process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
 
-    saved = read_checkpoint(path)[0]["agent"]
-    with gym.make("Pendulum-v1") as env:
-        policy = Policy(ObservationScaling(3), Actor(3, 1, TINY["actor_layers"]), env.action_space)
-    policy.actor.load_state_dict(saved["averaged_actor"])
-    policy.scaling.load_state_dict(saved["scaling"])
+    policy = load_policy(path)
+    assert same(
+        policy.state_dict(), {k[7:]: v for k, v in read_checkpoint(path)[0]["agent"].items() if k[:7] == "policy."}
+    )
     for batch, actions in zip(batches, torch.load(tmp_path / "actions.pt")):
         assert actions.shape == (len(batch), 1)
         torch.testing.assert_close(actions, policy(batch).detach(), rtol=1e-6, atol=1e-6)
@@ -786,19 +788,26 @@ def main(monkeypatch, *arguments):
     return 0
 
 
-def test_evaluates_the_best_policy(tiny_run, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["policy.pt", "best_policy.pt"])
+def test_evaluate_repeats_the_runs_evaluation(tiny_run, name, monkeypatch, capsys):
+    """The file tells the task, the networks and the seed."""
     path, _ = tiny_run
-    file = path / "best_policy.pt2"
-    arguments = ("--evaluate", file, "--env-id", "Pendulum-v1", "--num-eval-episodes", 2, "--no-video")
-    assert main(monkeypatch, *arguments) == 0
+    assert main(monkeypatch, "--evaluate", path / name, "--no-video") == 0
     line = capsys.readouterr().out.splitlines()[-1]
-    assert line.startswith(f"{file}: AverageReturn = ") and "AverageEpisodeLength = 200.0" in line
-    best = max(row["average_return"] for row in read_csv(path / "eval.csv"))
-    assert float(line.split(" = ")[1].split()[0]) == pytest.approx(best, rel=1e-3)
+    rows = read_csv(path / "eval.csv")
+    row = rows[-1] if name == "policy.pt" else max(rows, key=lambda row: row["average_return"])
+    assert line == (
+        f"{path / name}: AverageReturn = {row['average_return']:.6f} +/- {row['std_return']:.6f}, "
+        "AverageEpisodeLength = 200.000000 +/- 0.000000"
+    )
+    # Episodes of one's own choice.
+    assert main(monkeypatch, "--evaluate", path / name, "--no-video", "--num-eval-episodes", 1, "--seed", 9) == 0
+    assert "+/- 0.000000, Average" in capsys.readouterr().out
 
 
 def test_evaluate_plays_one_seeded_episode_in_the_tasks_units():
-    episode_return, length = sac_minitaur.evaluate(lambda o: torch.full((len(o), 1), 1.5), "Pendulum-v1", seed=3)
+    policy = SimpleNamespace(act=lambda observation: np.float32([1.5]))
+    episode_return, length = sac_minitaur.evaluate(policy, gym.spec("Pendulum-v1"), seed=3)
     with gym.make("Pendulum-v1") as env:
         env.reset(seed=3)
         rewards = [float(env.step(np.array([1.5], np.float32))[1]) for _ in range(200)]
@@ -846,44 +855,45 @@ def assert_one_line(status, stderr):
     assert status == 2 and len(lines) == 1 and lines[0].startswith("error: "), stderr
 
 
+OUT_OF_RANGE = """--batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
+    --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
+    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --n-step 0, --device tpu,
+    --actor-learning-rate -1, --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01,
+    --target-update-tau -0.1, --averaged-actor-tau 7, --reward-scale-factor inf, --initial-log-alpha nan, --seed -1,
+    --seed 9223372036854775808, --batch-size x, --wings 2""".split(",")
+
+
+@pytest.mark.parametrize("arguments", OUT_OF_RANGE)
+def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
+    flag, value = arguments.split()
+    status = main(monkeypatch, flag, value)
+    output = capfd.readouterr()
+    assert status == 2 and output.out == "" and "Traceback" not in output.err
+    assert flag in output.err or flag[2:].replace("-", "_") in output.err
+    assert len(output.err.splitlines()) < 20
+    if flag not in ("--wings", "--batch-size"):
+        with pytest.raises(ValidationError, match=flag[2:].replace("-", "_")):
+            Config(**{flag[2:].replace("-", "_"): [0] if "layers" in flag else value})
+
+
 @pytest.mark.parametrize(
     "arguments, named",
     [
         ("--env-id NoSuchTask-v0", "NoSuchTask"),
         ("--env-id no_such_module:Task-v0", "no_such_module"),
+        ("--env-id a:b:c", "a:b:c"),
+        ("--env-id .x:y-v0", ".x:y-v0"),
+        ("--env-id :y-v0", ":y-v0"),
         ("--env-id CartPole-v1", "Discrete"),
-        ("--device tpu", "tpu"),
         ("--device cuda:77", "cuda:77"),
         ("--batch-size 300", "--batch-size 300"),
-        ("--batch-size 0", "--batch-size"),
-        ("--num-iterations -5", "--num-iterations"),
-        ("--initial-collect-steps 0", "--initial-collect-steps"),
-        ("--collect-steps-per-iteration 0", "--collect-steps-per-iteration"),
-        ("--num-envs 0", "--num-envs"),
-        ("--replay-buffer-capacity -1", "--replay-buffer-capacity"),
         ("--replay-buffer-capacity 1000000000000", "--replay-buffer-capacity 1000000000000 takes 36000.0 GB"),
         ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
-        ("--num-threads 0", "--num-threads"),
-        ("--num-threads 1000000000", "from 1 to 1024"),
-        ("--log-interval 0", "--log-interval"),
-        ("--eval-interval -1", "--eval-interval"),
-        ("--num-eval-episodes 0", "--num-eval-episodes"),
-        ("--checkpoint-interval 0", "--checkpoint-interval"),
-        ("--critic-layers 0", "--critic-layers"),
-        ("--actor-learning-rate -1", "--actor-learning-rate"),
-        ("--critic-learning-rate nan", "--critic-learning-rate"),
-        ("--adam-epsilon -1", "--adam-epsilon"),
-        ("--adam-beta1 1", "--adam-beta1"),
-        ("--gamma 1.01", "--gamma"),
-        ("--target-update-tau -0.1", "--target-update-tau"),
-        ("--averaged-actor-tau 7", "--averaged-actor-tau"),
-        ("--reward-scale-factor inf", "--reward-scale-factor"),
-        ("--initial-log-alpha nan", "--initial-log-alpha"),
-        ("--seed -1", "--seed"),
-        ("--seed 9223372036854775808", "--seed"),
         ("--resume nowhere", "nowhere"),
-        ("--evaluate nowhere.pt2", "nowhere.pt2"),
+        ("--resume=", "checkpoint.pt"),  # as of a shell's variable that is not set
+        ("--evaluate nowhere.pt", "nowhere.pt"),
         ("--evaluate full/file", "full/file"),
+        ("--evaluate=", "policy"),
         ("--run-dir full", "not empty"),
         ("--run-dir full/file", "full/file"),
     ],
@@ -892,24 +902,15 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("somebody's work")
-    flag, value = arguments.split()
-    flags = {"--env-id": "Pendulum-v1", "--device": "cpu", "--initial-collect-steps": 250, "--batch-size": 32}
-    flags |= {"--num-iterations": 1, "--run-dir": "run", flag: value}
-    status = main(monkeypatch, *(word for pair in flags.items() for word in pair))
+    flags = (
+        "--env-id Pendulum-v1 --device cpu --initial-collect-steps 250 --batch-size 32 --num-iterations 1 --run-dir run"
+    )
+    status = main(monkeypatch, *flags.split(), *arguments.split())
     output = capfd.readouterr()
     assert_one_line(status, output.err)
     assert named in output.err and output.out == ""
     assert (tmp_path / "full" / "file").read_text() == "somebody's work"
-    assert not list(tmp_path.glob("run/*"))  # the corrected command may name the same directory
-
-
-@pytest.mark.parametrize("flag", ["--resume", "--evaluate"])
-def test_an_empty_path_does_not_train(flag, monkeypatch, capfd, tmp_path):
-    """As of a shell's variable that is not set."""
-    monkeypatch.chdir(tmp_path)
-    status = main(monkeypatch, flag, "")
-    assert_one_line(status, capfd.readouterr().err)
-    assert not any(tmp_path.iterdir())
+    assert not list(tmp_path.glob("run*"))  # the corrected command may name the same directory
 
 
 @pytest.mark.parametrize(
@@ -918,27 +919,23 @@ def test_an_empty_path_does_not_train(flag, monkeypatch, capfd, tmp_path):
         ("action", gym.spaces.Box(0, 200, (2,), np.uint8)),
         ("action", gym.spaces.Box(-1, np.inf, (2,))),
         ("action", gym.spaces.Box(np.float32([0, -1]), np.float32([0, 1]))),
+        ("action", gym.spaces.Box(np.float32(-3e38), np.float32(3e38), (2,))),  # its range is not finite in float32
+        ("action", gym.spaces.Box(-1e39, 1e39, (2,), np.float64)),
+        ("action", gym.spaces.Box(1.0, 1.0 + 1e-12, (2,), np.float64)),  # and here it is none
         ("action", gym.spaces.Box(-1, 1, ())),
         ("observation", gym.spaces.Box(-1, 1, ())),
         ("observation", gym.spaces.Discrete(3)),
     ],
 )
 def test_spaces_that_sac_cannot_use(kind, space, monkeypatch):
-    env = SimpleNamespace(observation_space=gym.spaces.Box(-1, 1, (2,)), action_space=gym.spaces.Box(-1, 1, (2,)))
-    monkeypatch.setattr(gym, "make", lambda env_id: env)
-    assert sac_minitaur.make_env("Task-v0") is env
+    env = StepCounter()
     setattr(env, f"{kind}_space", space)
+    monkeypatch.setitem(gym.registry, "Task-v0", gym.envs.registration.EnvSpec("Task-v0", entry_point=lambda: env))
     with pytest.raises(common.InputError, match=f"Task-v0 has the {kind} space"):
-        sac_minitaur.make_env("Task-v0")
+        common.find_task(Config(env_id="Task-v0"), gym.spaces.Box)
 
 
-@pytest.mark.parametrize("arguments", ["--env-id NoSuchTask-v0", "--env-id Pendulum-v1 --device cuda:77"])
-def test_bad_input_as_the_shell_sees_it(arguments, tmp_path):
-    command = [sys.executable, str(ROOT / "sac_minitaur.py"), *arguments.split()]
+def test_bad_input_as_the_shell_sees_it(tmp_path):
+    command = [sys.executable, str(ROOT / "sac_minitaur.py"), "--env-id", "NoSuchTask-v0"]
     process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert_one_line(process.returncode, process.stderr)
-
-
-def test_a_malformed_value_is_refused(monkeypatch, capfd):
-    assert main(monkeypatch, "--batch-size", "x") == 2
-    assert "--batch-size" in capfd.readouterr().err

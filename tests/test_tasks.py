@@ -1,0 +1,263 @@
+"""Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
+
+import subprocess
+import sys
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import common
+import sac_minitaur
+from sac_minitaur import Config, Policy
+from test_sac import TINY, load_policy, main, read_checkpoint, read_csv, train
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:gymnasium")  # what it says of such tasks
+SHORT = dict(initial_collect_steps=40, num_iterations=20, replay_buffer_capacity=60, n_step=1, log_interval=20)
+
+
+class Echo(gym.Env):
+    """Observes the number of the step and the action just taken, and checks that the action is in its space."""
+
+    def __init__(self, low=-1, high=1, dtype=np.float32, in_place=False, fails=None, error=None):
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+        self.action_space = gym.spaces.Box(low, high, (1,), dtype)
+        self.in_place, self.fails, self.error = in_place, fails, error
+        self.state = np.zeros(2, np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.fails == "reset":
+            raise self.error()
+        self.state[:] = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert action in self.action_space, action
+        if self.fails == "step":
+            raise self.error()
+        self.state += 1
+        self.state[1] = action[0]
+        if self.in_place:
+            action[:] = 99
+        return self._observation(), float(self.state[0]), False, False, {}
+
+    def _observation(self):
+        return self.state if self.in_place else self.state.copy()
+
+
+class Unrepeatable(Echo):
+    """Its episodes end when something outside says so, which is not the same on resume."""
+
+    length = 50
+
+    def step(self, action):
+        observation, reward, *_ = super().step(action)
+        return observation, reward, bool(self.state[0] >= self.length), False, {}
+
+
+class TwoArguments(Exception):
+    """It cannot be made anew from its message, as pickle would."""
+
+    def __init__(self, code, text):
+        super().__init__(f"{text}: {code}")
+
+
+gym.register("Echo-v0", entry_point=Echo, max_episode_steps=4)
+gym.register("Endless-v0", entry_point=Echo)
+gym.register("Unrepeatable-v0", entry_point=Unrepeatable, max_episode_steps=100)
+IDS = {"env_id": f"{__name__}:Echo-v0"}
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Registers an `Echo` for one test and returns its id."""
+
+    def register(**kwargs):
+        spec = gym.envs.registration.EnvSpec("Mine-v0", entry_point=Echo, max_episode_steps=4, kwargs=kwargs)
+        monkeypatch.setitem(gym.registry, "Mine-v0", spec)
+        return "Mine-v0"
+
+    return register
+
+
+@pytest.mark.parametrize("high", [1, 3])  # the agent's actions themselves, or rescaled
+def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
+    path, _ = train(tmp_path / "run", **SHORT, env_id=register(high=high, in_place=True), num_envs=2)
+    own = read_checkpoint(path)[1]
+    observations, actions, rewards, _, next_observations = own["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
+    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1) and torch.equal(
+        rewards, next_observations[:, :1]
+    )
+    assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
+    torch.testing.assert_close(next_observations[:, 1:], actions if high == 1 else 1 + 2 * actions)
+    # Those of the running episodes, to be played again on resume.
+    assert all(len(actions) == 2 and actions.abs().max() <= 1 for _, actions, _ in own["environments"]["episodes"])
+
+
+@pytest.mark.parametrize(
+    "dtype, low, high",
+    [(np.float32, -1, 0.2), (np.float64, -0.1, 0.7), (np.float16, -0.1, 0.7), (np.float16, -60000, 60000)],
+)
+def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, register, tmp_path, monkeypatch, capsys):
+    env_id = register(dtype=dtype, low=low, high=high)
+    path, _ = train(tmp_path / "run", **SHORT, env_id=env_id)
+    capsys.readouterr()
+    assert main(monkeypatch, "--evaluate", path / "policy.pt", "--video") == 0
+    output = capsys.readouterr().out
+    assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
+    assert "warning: no video (Echo.__init__() got an unexpected keyword argument 'render_mode'" in output
+    observations = torch.rand(5, 2)
+    exported = torch.export.load(path / "policy.pt2").module()(observations)
+    assert torch.equal(exported, load_policy(path)(observations))
+
+
+@pytest.mark.parametrize(
+    "dtype, scale", [(np.float32, 10), (np.float32, 1.7e38), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)]
+)
+def test_actions_never_leave_the_bounds(dtype, scale):
+    random = np.random.default_rng(0)
+    low, high = np.sort(random.uniform(-scale, scale, (2, 300)).astype(dtype), axis=0)
+    low[:2], high[:2] = (-1, 0.9 * scale), (0.2, scale)  # one rounding out, and an overflow of their sum
+    space = gym.spaces.Box(low, high, dtype=dtype)
+    policy = Policy(Config(actor_layers=()), gym.spaces.Box(-1, 1, (1,)), space)
+    received = []
+
+    class Task(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), space
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            received.append(action)
+            return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    env = sac_minitaur.make_training_env(gym.envs.registration.EnvSpec("Task-v0", Task), False)
+    env.reset()
+    for sign in (-1, 1, 0.999, -1e-3):
+        with torch.no_grad():
+            policy.actor.net[0].weight.zero_()
+            policy.actor.net[0].bias.fill_(np.arctanh(sign) if abs(sign) < 1 else 100 * sign)
+        acted, forward = policy.act(np.zeros(1)), policy(torch.zeros(2, 1))[1].detach().numpy()
+        env.step(np.full(300, sign, np.float32))
+        assert acted in space and received[-1] in space
+        assert (policy.low.numpy() <= forward).all() and (forward <= policy.high.numpy()).all()
+        exact = low.astype(float) + (high.astype(float) - low) * (1 + sign) / 2
+        tolerance = (1e-2 if dtype == np.float16 else 1e-5) * scale
+        for actions in (acted, received[-1], forward):
+            np.testing.assert_allclose(actions, exact, rtol=0, atol=tolerance)
+    assert env.action_space == gym.spaces.Box(-1, 1, (300,))
+
+
+def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
+    task = {"env_id": f"{__name__}:Endless-v0"}
+    assert common.find_task(Config(**task), gym.spaces.Box)[0].max_episode_steps == 10_000
+    path, _ = train(tmp_path / "run", **SHORT, **task, max_episode_steps=7)
+    assert "at most 7 steps an episode (--max-episode-steps)" in capsys.readouterr().out
+    assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
+    assert common.find_task(Config(env_id="Pendulum-v1"), gym.spaces.Box)[0].max_episode_steps == 200
+    assert (
+        common.find_task(Config(env_id="Pendulum-v1", max_episode_steps=300), gym.spaces.Box)[0].max_episode_steps == 300
+    )
+
+
+def test_a_task_that_wraps_another(monkeypatch):
+    """With a function, which gymnasium finds unequal to its like in the spec of an environment made before."""
+
+    def make():
+        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, gym.spaces.Box(-99, 99, (3,)))
+
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
+    task, observation_space, _ = common.find_task(Config(env_id="Mine-v0"), gym.spaces.Box)
+    assert task.max_episode_steps == 200 and observation_space.high[0] == 99  # the limit of the one that is wrapped
+    with gym.make(task) as env:
+        assert env.observation_space == observation_space
+
+
+@pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7)])
+@pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
+def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path):
+    with pytest.raises(common.TaskError) as caught:
+        train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
+    text = str(caught.value)
+    assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
+
+
+def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "broken_module.py").write_text("1 / 0")
+    with pytest.raises(ZeroDivisionError):
+        main(monkeypatch, "--env-id", "broken_module:Task-v0")
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", lambda: [].pop()))
+    with pytest.raises(IndexError):
+        main(monkeypatch, "--env-id", "Mine-v0")
+
+
+def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
+    once = iter([Echo()])
+
+    def make():
+        for env in once:
+            return env
+        raise ConnectionError("no second server")
+
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
+    with pytest.raises(common.TaskError, match="in make\n(.|\n)*no second server"):
+        train(tmp_path / "run", **SHORT, env_id="Mine-v0")
+
+
+def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, capsys):
+    choices = dict(critic_learning_rate=np.float64(1e-3), seed=np.int64(3), actor_layers=[16], num_envs=np.int32(1))
+    config = Config(**TINY | SHORT | IDS | choices, run_dir=tmp_path / "run")
+    path = sac_minitaur.train(config)
+    assert main(monkeypatch, "--resume", path, "--num-iterations", 25) == 0
+    assert read_checkpoint(path)[0]["step"] == 25
+    assert read_checkpoint(path)[0]["config"]["seed"] == 3
+    again = Config(**TINY | SHORT | IDS | choices | {"num_iterations": 30}, resume=str(path))
+    assert sac_minitaur.train(again) == path and read_checkpoint(path)[0]["step"] == 30
+
+
+def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path, capsys):
+    choices = SHORT | dict(env_id=f"{__name__}:Unrepeatable-v0", n_step=3, replay_buffer_capacity=200)
+    train(tmp_path / "run", **choices)
+    assert "warning" not in capsys.readouterr().out
+    monkeypatch.setattr(Unrepeatable, "length", 5)
+    train(tmp_path / "run", **choices | {"num_iterations": 40}, run_dir=None, resume=str(tmp_path / "run"))
+    assert "warning: an episode went differently" in capsys.readouterr().out
+    rows = read_checkpoint(tmp_path / "run")[1]["buffer"]["rows"]
+    assert len(rows) == 40 + 40 - 2 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MinitaurBulletEnv-v0"])
+@pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
+def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
+    if env_id != "Pendulum-v1":
+        pytest.importorskip("pybullet")
+    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20} | fault
+    with pytest.raises(common.RunError, match="not finite") as caught:
+        train(tmp_path / "run", **choices, env_id=env_id)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_task_that_only_the_main_program_knows(tmp_path):
+    """Where workers are not forked, as in a notebook on a Mac: here with an entry point that only cloudpickle takes."""
+    (tmp_path / "program.py").write_text(f"""
+import gymnasium as gym
+import common, sac_minitaur
+if __name__ == "__main__":
+    from gymnasium.envs.classic_control import PendulumEnv
+    common.START_METHOD = "spawn"
+    gym.register("Mine-v0", entry_point=lambda render_mode=None: PendulumEnv(render_mode), max_episode_steps=5)
+    choices = {TINY | SHORT} | dict(env_id="Mine-v0", num_eval_episodes=1, run_dir="run", video=True)
+    print(sac_minitaur.train(sac_minitaur.Config(**choices)))
+""")
+    paths = {"PYTHONPATH": str(Path(common.__file__).parent), "PATH": "", "SDL_VIDEODRIVER": "dummy"}
+    command = [sys.executable, "program.py"]
+    process = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
+    assert process.returncode == 0 and process.stdout.splitlines()[-1] == "run", process.stderr
+    assert (tmp_path / "run" / "trained_agent.mp4").exists(), process.stdout
