@@ -12,6 +12,7 @@ through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Ever
 "ours" in `Config`. README gives the reason for each.
 """
 
+import copy
 import math
 import warnings
 from functools import partial
@@ -47,11 +48,11 @@ class Config:
     batch_size: PositiveInt = 64  # transitions per update, over all processes
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
-    learning_rate_decay: PositiveInt | None = 1_000  # ours (theirs: None): updates after which the learning rate is half
+    learning_rate_half_life: PositiveInt | None = 2_000  # ours (theirs: None): updates that halve the learning rate
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorial leaves unsaid)
     epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default, left unsaid)
     gamma: Fraction = 0.99  # ours (TF-Agents' default, left unsaid: 1): discount
-    target_update_tau: Fraction = 0.02  # ours (theirs: 1): step of the target network towards the Q-network
+    target_update_tau: Fraction = 0.05  # ours (theirs: 1): step of the target network towards the Q-network
     value_unit: bool = True  # ours (theirs: no): the network's output counts in the worth of an endless episode
     advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): how far actions are pushed apart
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
@@ -83,7 +84,7 @@ class Config:
 
 
 TUTORIAL = dict(
-    learning_rate_decay=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
+    learning_rate_half_life=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
     observation_scaling=False,
 )  # fmt: skip
 
@@ -222,20 +223,16 @@ def td_loss(q, targets):
 
 
 class DQNAgent(nn.Module):
-    """The Q-network with its target network and optimizer, and the policy that is evaluated.
-
-    The policy acts by the target network, a running average of the Q-network: one snapshot of it may fail.
-    """
+    """The Q-network with its target network and optimizer, and the greedy policy that is evaluated."""
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
         self.config, self.device, self.ranks = config, device, ranks
         self.num_actions = int(action_space.n)
-        self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
-        self.scaling, self.target_network = self.policy.scaling, self.policy.q_network
-        self.q_network = QNetwork(math.prod(observation_space.shape), self.num_actions, config.layers)
-        self.q_network.load_state_dict(self.target_network.state_dict())
-        # Q = (mean reward + mean |reward| × the network's output) / (1 − γ); as long as nothing is fitted, the output.
+        self.policy = Policy(config, observation_space, action_space)
+        self.scaling, self.q_network = self.policy.scaling, self.policy.q_network
+        self.target_network = copy.deepcopy(self.q_network).requires_grad_(False)
+        # Q is offset + scale × the network's output: at first, and in the tutorial, the output itself.
         self.register_buffer("value_offset", torch.tensor(0.0))
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.to(device)
@@ -248,7 +245,11 @@ class DQNAgent(nn.Module):
         return torch.randint(self.num_actions, (count,)).numpy()
 
     def fit_scaling(self, observations, rewards):
-        """Fixes the scales of observations and values by observations (N, O) and rewards (N,) of all ranks."""
+        """Fixes the scales of observations and values by observations (N, O) and rewards (N,) of all ranks.
+
+        Q = (mean reward + mean |reward| × the network's output) / (1 − γ). The network starts near 0, so Q starts from
+        the worth of an endless episode, and only what ends it has to be learned.
+        """
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.value_unit:
@@ -260,9 +261,13 @@ class DQNAgent(nn.Module):
     def act(self, observations):
         """Epsilon-greedy actions (K,) for flat observations (K, O), numpy to numpy."""
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
-        greedy = self.q_network(self.scaling(observations)).argmax(1).cpu().numpy()
+        greedy = self.policy(observations).cpu().numpy()
         exploring = (torch.rand(len(greedy)) < self.config.epsilon).numpy()
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
+
+    def q_values(self, network, observations):
+        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). The unit is ours."""
+        return self.value_offset + self.value_scale * network(observations)
 
     def update(self, batch, step):
         """One gradient step of the Q-network, then of its target, after `step` updates.
@@ -274,23 +279,22 @@ class DQNAgent(nn.Module):
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
         s, next_s = self.scaling(s), self.scaling(next_s)  # ours
         with torch.no_grad():
-            next_q = self.value_offset + self.value_scale * self.target_network(next_s)  # Q̄(s', ·): (B, A); the unit: ours
+            next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
             if config.advantage_learning:  # ours: y − part × (max Q̄(s, ·) − Q̄(s, a))
-                y -= config.advantage_learning * self.value_scale * action_gap(self.target_network(s), a)
-        q = self.value_offset + self.value_scale * self.q_network(s)  # Q(s, ·): (B, A)
-        q = q.gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
+                y -= config.advantage_learning * action_gap(self.q_values(self.target_network, s), a)
+        q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
         loss = td_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
         loss.backward()
         self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])
-        if config.learning_rate_decay:  # ours
-            self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + step / config.learning_rate_decay)
+        if config.learning_rate_half_life:  # ours
+            self.optimizer.param_groups[0]["lr"] = config.learning_rate * 0.5 ** (step / config.learning_rate_half_life)
         self.optimizer.step()
 
-        with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄); τ: ours
+        with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄)
             for target, parameter in zip(self.target_network.parameters(), self.q_network.parameters()):
-                target.lerp_(parameter, config.target_update_tau)
+                target.lerp_(parameter, config.target_update_tau)  # ours: τ below 1
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
 
 
