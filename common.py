@@ -16,7 +16,6 @@ import math
 import multiprocessing
 import os
 import pickle
-import re
 import shlex
 import signal
 import sys
@@ -79,7 +78,7 @@ def run_main(main):
         main()
     except (InputError, RunError) as error:
         if int(os.environ.get("RANK", 0)) > 0:
-            time.sleep(1)  # rank 0 mostly fails for the same reason, and torchrun then ends this one: one line is printed
+            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
         # An orderly exit would wait for other ranks, or for workers that are gone.
         if dist.is_initialized() or isinstance(error, RunError):
@@ -132,16 +131,13 @@ def plain_config(config):
 def select_device(name, local_rank=0):
     """The `torch.device` for --device: `auto` is CUDA or else the CPU, `cuda` is GPU number `local_rank`.
 
-    Raises InputError for a name that is unknown or a device that is not there.
+    Raises InputError for a device that is not there.
     """
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    match = re.fullmatch(r"cpu|mps|cuda(?::(\d+))?", name)
-    if not match:
-        raise InputError(f"--device {name} is not a device: use auto, cpu, cuda, cuda:N or mps")
-    device = torch.device("cuda", int(match[1] or local_rank)) if name.startswith("cuda") else torch.device(name)
     gpus = torch.cuda.device_count()
-    if name == "mps" and not torch.backends.mps.is_available() or device.type == "cuda" and device.index >= gpus:
+    if name == "auto":
+        name = "cuda" if gpus else "cpu"
+    device = torch.device(f"cuda:{local_rank}" if name == "cuda" else name)
+    if device.type == "mps" and not torch.backends.mps.is_available() or device.type == "cuda" and device.index >= gpus:
         raise InputError(f"--device {name} is not there (CUDA GPUs found: {gpus}): use auto or cpu")
     return device
 
@@ -169,6 +165,11 @@ def empty_replay(capacity, columns, device):
 def episode_seed(*key):
     """A 32-bit seed for one episode from integers such as (seed, env index, episode number)."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
+
+
+def evaluation_seeds(config):
+    """The seeds of the episodes that every evaluation of a run plays."""
+    return [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
 
 
 # Several processes that train one agent
@@ -241,14 +242,15 @@ def find_task(config, action_space):
     if not isinstance(observations, gym.spaces.Box) or not observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
     if action_space is gym.spaces.Discrete:
-        fits, needed = isinstance(actions, gym.spaces.Discrete) and actions.start == 0, "Discrete from 0"
+        fits = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
     else:
-        fits, needed = isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f", "bounded Box"
+        fits = isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f"
         with np.errstate(all="ignore"):
-            width = np.subtract(actions.high, actions.low, dtype=np.float32) if fits else np.zeros(1)
-        fits = (np.isfinite(width) & (width > 0)).all()
+            widths = np.subtract(actions.high, actions.low, dtype=np.float32) if fits else np.zeros(1)
+        fits = (np.isfinite(widths) & (widths > 0)).all()
     if not fits:
-        raise InputError(f"{name} has the action space {actions}: this algorithm needs a {needed}")
+        needed = "Discrete from 0" if action_space is gym.spaces.Discrete else "Box of real numbers with finite bounds"
+        raise InputError(f"{name} has the action space {actions}: a {needed} is needed")
     return task, observations, actions
 
 
@@ -445,9 +447,9 @@ def _in_worker(function, policy_file, *arguments):
 class Run:
     """One training run: its processes, device, directory and evaluations, and the checkpoint that it continues from.
 
-    The directory holds `config.json`, a CSV for each table of metrics (`train`, `eval`, `random`), TensorBoard's events,
-    the checkpoint, the policies, the curve and the videos. A checkpoint has the tables too: on resume the files are
-    written anew from it. Rank 0 alone evaluates, writes and prints.
+    The directory holds `config.json`, a CSV for each table of metrics (`train`, `eval`, `random`), TensorBoard's
+    events, the checkpoint, the policies, the curve and the videos. A checkpoint has the tables too: on resume the files
+    are written anew from it. Rank 0 alone evaluates, writes and prints.
     """
 
     def __init__(self, config, script, task, evaluate):
@@ -476,13 +478,13 @@ class Run:
         self.stack = contextlib.ExitStack()
 
     def _require_same_run(self, saved):
-        config = plain_config(self.config) | {"run_dir": self.config.run_dir}
+        config = plain_config(self.config) | {"run_dir": self.config.run_dir}  # a run cannot move
         changed = [n for n in config if config[n] != saved[n] and n not in MAY_DIFFER_ON_RESUME]
         if config["num_iterations"] < saved["num_iterations"]:
             changed.append("num_iterations")
         for name in changed:
             flag = f"--{name.replace('_', '-')} {config[name]}"
-            raise InputError(f"{flag}: the run to resume has {saved[name]}. It cannot change (--num-iterations may grow)")
+            raise InputError(f"{flag} differs from the run to resume, which has {saved[name]}: leave it out")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
 
@@ -555,10 +557,9 @@ class Run:
         bar = self.writes and getattr(sys.stderr, "isatty", bool)()
         self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
         self.stack.callback(self.progress.close)
-        processes = f", process 0 of {self.ranks.world_size}" if self.ranks.world_size > 1 else ""
-        self.print(f"{config.env_id}, at most {self.task.max_episode_steps} steps an episode (--max-episode-steps)")
-        self.print(f"device {self.device}, {config.num_threads} CPU thread(s){processes}, seed {config.seed}")
-        self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full; run directory {self.path}")
+        self.print(f"{config.env_id}, seed {config.seed}, episodes of at most {self.task.max_episode_steps} steps")
+        self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
+        self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         if environments.lost.any():
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)
@@ -637,7 +638,7 @@ class Run:
         self.print(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
     def evaluate(self, step, env_steps, policy):
-        """Plays the evaluation episodes with `policy` (None: random actions) and logs how they went, once for each step.
+        """Plays the evaluation episodes with `policy` (None: random actions) and logs how they went, once a step.
 
         The best policy so far is saved. A stop request ends this early; the resumed run does it again.
         """
@@ -650,7 +651,9 @@ class Run:
         while not self.stopping and futures.wait(episodes, timeout=0.1).not_done:
             pass
         if self.stopping:
-            return [episode.cancel() for episode in episodes]
+            for episode in episodes:
+                episode.cancel()
+            return
         row, text = summarize([episode.result() for episode in episodes])
         self._log(table, step, env_steps, row)
         self.print(f"{f'step = {step}' if policy else 'random policy'}: {text}")
@@ -671,10 +674,11 @@ class Run:
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
     def _film(self, policies, name, *arguments):
-        return self._in_pool(film, policies, name, [(evaluation_seeds(self.config)[0], self.path / name, *arguments)])[0]
+        arguments = evaluation_seeds(self.config)[0], self.path / name, *arguments
+        return self._in_pool(film, policies, name, [arguments])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
-        """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for weights not finite."""
+        """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for weights gone wrong."""
         self.saved_step = step
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
@@ -688,8 +692,9 @@ class Run:
                 raise RunError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
         state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
+        state |= {"tables": self.tables, "best": self.best, "snapshots": self.snapshots}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
-        self._save("checkpoint.pt", "checkpoint", state | {"tables": self.tables, "best": self.best, "snapshots": self.snapshots})
+        self._save("checkpoint.pt", "checkpoint", state)
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
@@ -740,11 +745,6 @@ def or_warn(what, say):
         say(f"warning: no {what} ({first_line(error)})")
 
 
-def evaluation_seeds(config):
-    """The seeds of a run's evaluation episodes, the same at every evaluation."""
-    return [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
-
-
 def summarize(results):
     """The metrics of evaluation episodes, from a list of (return, length), and a line that tells them."""
     (mean, length), (spread, spread_length) = np.mean(results, axis=0).tolist(), np.std(results, axis=0).tolist()
@@ -756,7 +756,7 @@ def summarize(results):
 
 
 def evaluate_policy(config, script, policy, task, evaluate):
-    """What --evaluate PATH does: plays the episodes that the run was evaluated with, tells the returns and films one."""
+    """What --evaluate PATH does: plays the episodes that its run was evaluated with, tells the returns, films one."""
     try:
         policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
     except RuntimeError:
@@ -808,7 +808,8 @@ def film(policies, task, seed, path, captions=(None,), seconds=math.inf, max_fps
     def frame(caption):
         image = Image.fromarray(env.render())
         if caption:
-            ImageDraw.Draw(image).text((8, 8), caption, "black", ImageFont.load_default(20), stroke_width=2, stroke_fill="white")
+            font, outline = ImageFont.load_default(20), {"stroke_width": 2, "stroke_fill": "white"}
+            ImageDraw.Draw(image).text((8, 8), caption, "black", font, **outline)
         return np.asarray(image)
 
     def write(file):

@@ -48,7 +48,7 @@ class Config:
     batch_size: PositiveInt = 64  # transitions per update, over all processes
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
-    learning_rate_half_life: PositiveInt | None = 2_000  # ours (theirs: None): updates that halve the learning rate
+    learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): updates until the learning rate is half
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorial leaves unsaid)
     epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default, left unsaid)
     gamma: Fraction = 0.99  # ours (TF-Agents' default, left unsaid: 1): discount
@@ -84,7 +84,7 @@ class Config:
 
 
 TUTORIAL = dict(
-    learning_rate_half_life=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
+    learning_rate_decay=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
     observation_scaling=False,
 )  # fmt: skip
 
@@ -288,8 +288,8 @@ class DQNAgent(nn.Module):
         self.optimizer.zero_grad()
         loss.backward()
         self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])
-        if config.learning_rate_half_life:  # ours
-            self.optimizer.param_groups[0]["lr"] = config.learning_rate * 0.5 ** (step / config.learning_rate_half_life)
+        if config.learning_rate_decay:  # ours: lr / (1 + (step / decay)²)
+            self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         self.optimizer.step()
 
         with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄)

@@ -1,6 +1,6 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
-    python sac_minitaur.py                                    # half an hour to an hour on two CPU cores, return 25 to 32
+    python sac_minitaur.py                                    # half an hour on two quiet CPU cores, return 25 to 32
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt      # evaluates and films a saved policy
@@ -50,16 +50,16 @@ class Config:
     critic_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorials leave unsaid)
-    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.5  # ours, and CrossQ's (theirs: 0.9): decay of Adam's mean gradient
+    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
-    critic_batch_norm: bool = True  # ours (theirs: no): normalize, and need no target critics (CrossQ, arXiv:1902.05605)
+    critic_batch_norm: bool = True  # ours (theirs: no): normalize, without target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: Fraction = 0.005  # step of the target critics, if any, towards the critics after every update
     gamma: Fraction = 0.99  # discount
     n_step: PositiveInt = 3  # ours (theirs: 1): steps whose rewards a target sums before it bootstraps
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by the spread of the initial random data's returns
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1, the actor itself): step of the evaluated average of the actor
-    mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the policy that is evaluated
+    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1, no average): step of the evaluated average of the actor
+    mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default, left unsaid)
     target_entropy_per_action: float = -1.0  # ours, the paper's −|A| (TF-Agents' default, left unsaid: −|A|/2, so −0.5)
     initial_log_alpha: float = -2.0  # ours (TF-Agents' default, left unsaid: 0)
@@ -115,7 +115,7 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
 
 
 class ObservationScaling(nn.Module):
-    """Standardizes observations (…, S) by a fixed mean and standard deviation, clipped to ±10; the identity until `fit`."""
+    """Standardizes observations (…, S) by a fixed mean and deviation, clipped to ±10; the identity until `fit`."""
 
     def __init__(self, observation_size):
         super().__init__()
@@ -264,7 +264,8 @@ class ReplayBuffer:
     def state_dict(self):
         """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
         incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
-        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position, "incomplete": incomplete}
+        rows = self.rows[: self.size].to("cpu", copy=True)
+        return {"rows": rows, "position": self.position, "incomplete": incomplete}
 
     def load_state_dict(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
@@ -455,8 +456,8 @@ class AppendPrivileged(gym.ObservationWrapper):
 
     def __init__(self, env):
         super().__init__(env)
-        own, privileged = env.observation_space, env.unwrapped.privileged_space
-        self.observation_space = gym.spaces.Box(np.append(own.low, privileged.low), np.append(own.high, privileged.high))
+        own, more = env.observation_space, env.unwrapped.privileged_space
+        self.observation_space = gym.spaces.Box(np.append(own.low, more.low), np.append(own.high, more.high))
 
     def observation(self, observation):
         return np.append(observation, self.unwrapped.privileged_observation())
@@ -670,8 +671,8 @@ class MinitaurBulletEnv(gym.Env):
     def _draw_dynamics(self):
         uniform = self.np_random.uniform
         links = (self.BASE_LINK, self.LEG_LINKS[0], self.MOTOR_LINKS[0])
-        masses = (self.simulator.getDynamicsInfo(self.robot, link)[0] for link in links)
-        return Dynamics(*(m * uniform(0.8, 1.2) for m in masses), uniform(14.8, 16.8), uniform(0, 0.01), uniform(0.8, 1.5))
+        masses = [self.simulator.getDynamicsInfo(self.robot, link)[0] * uniform(0.8, 1.2) for link in links]
+        return Dynamics(*masses, uniform(14.8, 16.8), uniform(0, 0.01), uniform(0.8, 1.5))
 
     def _apply_dynamics(self):
         change, dynamics = self.simulator.changeDynamics, self.dynamics
@@ -711,7 +712,7 @@ class MinitaurBulletEnv(gym.Env):
         return math.pi + -math.pi / 4 * (extension + 1.5) + quarter * swing
 
     def _substep(self, command):
-        """Drives the motors towards the angles `command` for 0.002 s (pybullet's motor.py, in its order of operations)."""
+        """Drives the motors towards the angles `command` for 0.002 s, in the order of pybullet's motor.py."""
         simulator, dynamics = self.simulator, self.dynamics
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
         drive = pwm * dynamics.voltage
@@ -752,7 +753,7 @@ class MinitaurBulletEnv(gym.Env):
         """The robot from the side that it runs past, (360, 480, 3) uint8, from pybullet's software renderer."""
         simulator = self.simulator
         position, _ = simulator.getBasePositionAndOrientation(self.robot)
-        view = simulator.computeViewMatrixFromYawPitchRoll(position, distance=1, yaw=0, pitch=-30, roll=0, upAxisIndex=2)
+        view = simulator.computeViewMatrixFromYawPitchRoll(position, 1, yaw=0, pitch=-30, roll=0, upAxisIndex=2)
         projection = simulator.computeProjectionMatrixFOV(fov=60, aspect=480 / 360, nearVal=0.1, farVal=100)
         pixels = simulator.getCameraImage(480, 360, view, projection, renderer=simulator.ER_TINY_RENDERER)[2]
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]

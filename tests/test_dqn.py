@@ -224,11 +224,11 @@ def test_update_moves_what_it_should():
     assert set(metrics) == {"loss", "mean_q"} and not any(value.requires_grad for value in metrics.values())
 
 
-def test_learning_rate_halves():
-    """After every second update with a half-life of 2; never without one."""
-    for half_life, expected in ((2, [0.01, 0.01 / math.sqrt(2), 0.005]), (None, 3 * [0.01])):
-        agent, rates = make_agent(learning_rate=0.01, learning_rate_half_life=half_life), []
-        for step in range(3):
+def test_learning_rate_decays():
+    """It is half after 2 updates with a decay of 2, a tenth after 6, and stays as it is without."""
+    for decay, expected in ((2, [0.01, 0.005, 0.001]), (None, 3 * [0.01])):
+        agent, rates = make_agent(learning_rate=0.01, learning_rate_decay=decay), []
+        for step in (0, 2, 6):
             agent.update(random_batch(), step)
             rates.append(agent.optimizer.param_groups[0]["lr"])
         assert rates == pytest.approx(expected)
@@ -474,7 +474,7 @@ def test_bad_input_from_the_shell():
         ("num_envs", (0,)),
         ("layers", ((-4,),)),
         ("learning_rate", (-1, math.nan)),
-        ("learning_rate_half_life", (0,)),
+        ("learning_rate_decay", (0,)),
         ("epsilon", (3,)),
         ("target_update_tau", (5,)),
         ("gamma", (-1, 1)),
@@ -498,7 +498,7 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "0.9"])
     config = common.read_command_line(Config, "", "dqn_cartpole")
     assert config == Config(tutorial=True, gamma=0.9)
-    assert (config.learning_rate_half_life, config.target_update_tau, config.gamma) == (None, 1.0, 0.9)
+    assert (config.learning_rate_decay, config.target_update_tau, config.gamma) == (None, 1.0, 0.9)
     assert (config.value_unit, config.advantage_learning, config.observation_scaling) == (False, 0.0, False)
     assert Config(tutorial=True).gamma == 1.0
 
