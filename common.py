@@ -51,23 +51,19 @@ MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "devic
 
 
 class InputError(Exception):
-    """Something the user gave cannot be used. They see the message, one line; the exit status is 2."""
-
-    exit_status = 2
+    """Something the user gave cannot be used."""
 
 
 class RunError(Exception):
-    """Something failed while running: a full disk, a dead worker, a loss that is not finite. The exit status is 1."""
-
-    exit_status = 1
+    """Something failed while running: a full disk, a dead worker, a loss that is not finite."""
 
 
 class TaskError(Exception):
-    """The task's own code raised an exception, perhaps in a worker. The message is its traceback."""
+    """The task's own code failed, perhaps in a worker. The message is its traceback."""
 
 
 def run_main(main):
-    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status."""
+    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status 2 or 1."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
@@ -80,10 +76,9 @@ def run_main(main):
         if int(os.environ.get("RANK", 0)) > 0:
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        # An orderly exit would wait for other ranks, or for workers that are gone.
-        if dist.is_initialized() or isinstance(error, RunError):
-            os._exit(error.exit_status)
-        sys.exit(error.exit_status)
+        if isinstance(error, RunError) or dist.is_initialized():
+            os._exit(1 if isinstance(error, RunError) else 2)  # others are not waited for: they may be gone
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
 
@@ -468,9 +463,10 @@ class Run:
         # To the microsecond, for runs that are started at once.
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
         self.path = config.resume or config.run_dir or Path("runs") / name
-        self.tables = self.checkpoint.get("tables", {"train": [], "eval": [], "random": []})
-        self.best = self.checkpoint.get("best", {"return": -math.inf, "weights": None})
-        self.snapshots = self.checkpoint.get("snapshots", [])  # captions and weights, for the film of how it learned
+        # What the run has found so far; a snapshot is a caption and the policy's weights, for the film of how it learned.
+        new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
+        self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
+        self.tables = self.found["tables"]
         self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.last_logged = time.monotonic(), self.saved_step
@@ -586,8 +582,8 @@ class Run:
             for row in rows:
                 self._write_summary(table, row)
             self._write_table(table)
-        if self.best["weights"]:  # the file may be of an evaluation that came after the checkpoint
-            self._save("best_policy.pt", "policy", {"weights": self.best["weights"]})
+        if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
+            self._save("best_policy.pt", "policy", {"weights": weights})
 
     def print(self, line):
         """Prints a line, above the progress bar. A run whose output nobody reads any more goes on."""
@@ -660,12 +656,12 @@ class Run:
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             # Five policies, closer to each other at the beginning, where most is learned.
-            if step >= (len(self.snapshots) / 4) ** 2 * self.config.num_iterations:
-                caption = f"{step} updates: return {row['average_return']:.1f}"
-                self.snapshots.append((caption, policy.state_dict()))
-            if row["average_return"] > self.best["return"]:
-                self.best = {"return": row["average_return"], "weights": policy.state_dict()}
-                self._save("best_policy.pt", "policy", {"weights": self.best["weights"]})
+            weights = policy.state_dict()
+            if step >= (len(self.found["snapshots"]) / 4) ** 2 * self.config.num_iterations:
+                self.found["snapshots"].append((f"{step} updates: return {row['average_return']:.1f}", weights))
+            if row["average_return"] > self.found["best"][0]:
+                self.found["best"] = row["average_return"], weights
+                self._save("best_policy.pt", "policy", {"weights": weights})
 
     def _in_pool(self, function, policy, name, arguments):
         """Futures of `function(policy, task, *arguments)` in the pool's workers, for each of these arguments."""
@@ -692,9 +688,8 @@ class Run:
                 raise RunError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
         state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
-        state |= {"tables": self.tables, "best": self.best, "snapshots": self.snapshots}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
-        self._save("checkpoint.pt", "checkpoint", state)
+        self._save("checkpoint.pt", "checkpoint", state | self.found)
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
@@ -716,16 +711,16 @@ class Run:
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
-            learning = [copy.deepcopy(policy) for _ in self.snapshots]
-            for each, (_, weights) in zip(learning, self.snapshots):
-                each.load_state_dict(weights)
-            captions = [caption for caption, _ in self.snapshots]
+            captions, weights = zip(*self.found["snapshots"])
+            learning = [copy.deepcopy(policy) for _ in weights]
+            for each, own in zip(learning, weights):
+                each.load_state_dict(own)
             films["learning.mp4"] = self._film(learning, "learning.mp4", captions, 4, 25)
             films["trained_agent.mp4"] = self._film([policy], "trained_agent.mp4")
             films["random_agent.mp4"] = self._film([None], "random_agent.mp4")
         with or_warn("exported policy", self.print):
             export_policy(self.path / "policy.pt2", policy, observation_space.shape)
-            policy.load_state_dict(self.best["weights"])
+            policy.load_state_dict(self.found["best"][1])
             export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
             with or_warn(name, self.print):
