@@ -694,7 +694,7 @@ class Run:
         title = f"{self.config.env_id}, seed {self.config.seed}"
         with self._or_warn("learning_curve.png"):
             plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
-        if self.stopped:
+        if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:

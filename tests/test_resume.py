@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
+import imageio
 import pytest
 import torch
 
@@ -94,7 +95,7 @@ def between_policy_and_checkpoint(module):
 
 def filming(module):
     main = os.getpid()
-    before_call(common, "film", 1, lambda: os.kill(main, signal.SIGKILL))
+    before_call(imageio, "get_writer", 1, lambda: os.kill(main, signal.SIGKILL))
 
 
 MOMENTS = (collecting, evaluating, updating, writing_a_checkpoint, between_policy_and_checkpoint, filming)
@@ -193,13 +194,17 @@ def updating_a_little(module):
 
 
 def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
-    """Where its file was written after the checkpoint, and no evaluation to come is as good."""
+    """Where its file was written after the checkpoint, and no evaluation to come is as good.
+
+    Also on another machine than the one with the GPU that the run began on, with other flags of the machine's.
+    """
     shutil.copytree(reference, tmp_path / "run")
     state = checkpoint(tmp_path / "run")
     state["best"]["return"] = 1e9
+    state["config"]["device"] = "cuda:7"
     torch.save(state, tmp_path / "run" / "checkpoint.pt")
     (tmp_path / "run" / "best_policy.pt").write_bytes(b"of an evaluation to come")
-    finish(script, ["--resume", tmp_path / "run"], tmp_path / "output")
+    finish(script, ["--resume", tmp_path / "run", "--device", "cpu", "--num-threads", 2], tmp_path / "output")
     saved = common.read_file(tmp_path / "run" / "best_policy.pt", "policy", script)
     assert_same(saved["weights"], state["best"]["weights"])
 
@@ -219,37 +224,37 @@ def stop_and_continue(script, run_dir, output, arguments, hook):
     return step
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_stop_and_continue(script, reference, tmp_path, name):
+def test_stop_and_continue(script, reference, tmp_path):
     """A checkpoint at this very step, the curve, and a line with the command that continues, quoted for a shell."""
     arguments = flags(script, tmp_path / "a run", "--num-envs", 2)
-    hook = partial(signal_the_group, number=getattr(signal, name))
-    assert stop_and_continue(script, tmp_path / "a run", tmp_path, arguments, hook) == 110
+    assert stop_and_continue(script, tmp_path / "a run", tmp_path, arguments, signal_the_group) == 110
     assert_same_run(tmp_path / "a run", reference)
 
 
-def signal_the_group(module, number):
+def signal_the_group(module):
     """As a terminal and torchrun do."""
+    number = signal.SIGTERM if module.__name__ == "sac_minitaur" else signal.SIGINT
     before_update(module, 110, lambda: os.killpg(0, number))
 
 
-@pytest.mark.parametrize("step", [100, 300])
-def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path, step):
+def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path):
     """It is left out, at once, and done when the run is continued. Also the last one."""
     arguments = flags(script, tmp_path / "run", "--num-envs", 2)
-    hook = partial(stop_while_evaluating, step=step)
+    step = 100 if script == "sac_minitaur" else 300
+    hook = partial(hang_up_in_an_evaluation, step=step)
     assert stop_and_continue(script, tmp_path / "run", tmp_path, arguments, hook) == step
     assert_same_run(tmp_path / "run", reference)
 
 
-def stop_while_evaluating(module, step):
+def hang_up_in_an_evaluation(module, step):
+    """As a terminal that is closed."""
     evaluate = common.Run.evaluate
 
-    def evaluate_slowly(run, at, *more):
+    def evaluate_slowly(run, at, env_steps, policy):
         if at == step:
             run.evaluate_episode = play_for_ever
-            threading.Timer(0.5, interrupt).start()
-        return evaluate(run, at, *more)
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGHUP)).start()
+        return evaluate(run, at, env_steps, policy)
 
     common.Run.evaluate = evaluate_slowly
 
@@ -318,9 +323,8 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
         if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads"):
             common.Run(continued, script, None, None)
         else:
-            with pytest.raises(common.InputError, match=rf"--{field.replace('_', '-')} .*\.?") as error:
+            with pytest.raises(common.InputError, match=f"^--{field.replace('_', '-')} .*It cannot change[^\n]*$"):
                 common.Run(continued, script, None, None)
-            assert "\n" not in str(error.value)
     with pytest.raises(common.InputError, match="--num-iterations 299: the run to resume has 300"):
         common.Run(dataclasses.replace(config, num_iterations=299), script, None, None)
 
@@ -332,46 +336,22 @@ def test_refusal_at_the_command_line(script, reference, tmp_path):
         assert run.stderr.count("\n") == 1 and run.stderr.startswith("error: ") and word in run.stderr
 
 
-def test_device_and_threads_may_differ(script, reference, tmp_path):
-    """Begun on a GPU that this machine has not, say."""
+def test_a_task_that_cannot_be_played_again(script, reference, tmp_path):
+    """It draws from a generator that no seed governs: an episode has ended, a new one begins, and the user is told."""
     shutil.copytree(reference, tmp_path / "run")
-    state = checkpoint(tmp_path / "run")
-    state["config"]["device"] = "cuda:7"
-    torch.save(state, tmp_path / "run" / "checkpoint.pt")
-    more = ["--device", "cpu", "--num-threads", 2, "--num-iterations", 320]
-    finish(script, ["--resume", tmp_path / "run", *more], tmp_path / "output")
-    assert checkpoint(tmp_path / "run")["step"] == 320
-
-
-def test_a_task_that_cannot_be_played_again(script, tmp_path):
-    """It draws from a generator that no seed governs: the episode had ended, a new one begins, and the user is told."""
-    arguments = flags(script, tmp_path / "run", "--num-envs", 2, "--num-iterations", 110)
-    finish(script, arguments, tmp_path / "1", partial(end_early, steps=10**6))
-    # Now each episode ends after one step.
-    run = finish(script, ["--resume", tmp_path / "run", "--num-iterations", 150], tmp_path / "2", partial(end_early, steps=1))
-    assert "warning: an episode went differently" in run.stdout and checkpoint(tmp_path / "run")["step"] == 150
+    run = finish(script, ["--resume", tmp_path / "run", "--num-iterations", 320], tmp_path / "output", end_early)
+    assert "warning: an episode went differently" in run.stdout and checkpoint(tmp_path / "run")["step"] == 320
 
 
 class EndsEarly(gym.Wrapper):
-    """Ends its episodes after a number of steps that the test chooses."""
-
-    def __init__(self, env, steps):
-        super().__init__(env)
-        self.steps = steps
-
-    def reset(self, **arguments):
-        self.left = self.steps
-        return self.env.reset(**arguments)
-
     def step(self, action):
         observation, reward, terminated, _, info = self.env.step(action)
-        self.left -= 1
-        return observation, reward, terminated, self.left <= 0, info
+        return observation, reward, terminated, True, info
 
 
-def end_early(module, steps):
+def end_early(module):
     make = module.make_training_env
-    module.make_training_env = lambda *arguments: EndsEarly(make(*arguments), steps)
+    module.make_training_env = lambda *arguments: EndsEarly(make(*arguments))
 
 
 def test_minitaur_resumes_exactly(tmp_path):
