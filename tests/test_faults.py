@@ -261,10 +261,6 @@ def close_stdout(module):
     sys.stdout = None
 
 
-def close_stdout_later(module):
-    before_update(module, 50, lambda: sys.stdout.close())
-
-
 def replace_stderr(module):
     sys.stderr = SimpleNamespace(write=len, flush=lambda: None)
 
@@ -276,11 +272,29 @@ def have_no_streams(module):
     sys.stdout = sys.stderr = None
 
 
-@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, close_stdout_later, replace_stderr, have_no_streams])
+@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams])
 def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
     assert (tmp_path / "run" / "best_policy.pt2").exists()
+
+
+def test_stops_without_a_console(tmp_path):
+    """The message about it goes to no file that has taken the closed console's number."""
+    finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", have_no_streams_and_stop)
+    assert checkpoint(tmp_path / "run")["step"] == 50
+    assert not any(b"Ctrl-C" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+
+
+def have_no_streams_and_stop(module):
+    have_no_streams(module)
+
+    def reuse_their_numbers_and_stop():
+        while os.open(Path(sys.argv[-1]) / "notes", os.O_WRONLY | os.O_CREAT) < 2:
+            pass
+        interrupt()
+
+    before_update(module, 50, reuse_their_numbers_and_stop)
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "cp437"])

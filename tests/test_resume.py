@@ -248,7 +248,8 @@ def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path):
 
 
 def hang_up_in_an_evaluation(module, step):
-    """As a terminal that is closed."""
+    """As a terminal that is closed. On one core, so that an episode still waits for a worker."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     evaluate = common.Run.evaluate
 
     def evaluate_slowly(run, at, env_steps, policy):
@@ -353,6 +354,16 @@ class EndsEarly(gym.Wrapper):
 def end_early(module):
     make = module.make_training_env
     module.make_training_env = lambda *arguments: EndsEarly(make(*arguments))
+
+
+def test_where_processes_are_spawned(reference, script, tmp_path):
+    """As on macOS and Windows."""
+    finish(script, flags(script, tmp_path / "run", "--num-envs", 2), tmp_path / "output", spawn)
+    assert_same_run(tmp_path / "run", reference)
+
+
+def spawn(module):
+    common.START_METHOD = "spawn"
 
 
 def test_minitaur_resumes_exactly(tmp_path):
