@@ -1,4 +1,4 @@
-"""Damaged and hostile files, full disks, dead workers, odd consoles, losses that are not numbers: one line, nothing lost."""
+"""Damaged and hostile files, full disks, dead workers, odd consoles, losses that are not numbers: one line."""
 
 import importlib
 import io
@@ -15,6 +15,7 @@ import zipfile
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import gymnasium as gym
 import imageio
@@ -23,7 +24,7 @@ import pytest
 import torch
 
 import common
-from runs import ROOT, SCRIPTS, TASK, Process, checkpoint, flags, rows, session, wait_until
+from runs import ROOT, SCRIPTS, Process, checkpoint, flags, rows, session, wait_until
 from test_resume import assert_same_run, before_call, before_update, die, finish, interrupt
 from test_resume import reference, script  # noqa: F401 (fixtures)
 
@@ -37,8 +38,8 @@ def assert_one_line(run, status, *words):
 
 def refusal(script, *arguments):  # noqa: F811
     """The one line that refuses this command line."""
-    sys.argv = [f"{script}.py", *map(str, arguments)]
-    with pytest.raises(common.InputError, match="^[^\n]*$") as error:
+    argv = mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)])
+    with argv, pytest.raises(common.InputError, match="^[^\n]*$") as error:
         common.read_command_line(importlib.import_module(script).Config, "", script)
     return str(error.value)
 
@@ -302,7 +303,7 @@ def test_console_that_cannot_show_everything(script, encoding):  # noqa: F811
     command = [sys.executable, ROOT / f"{script}.py", "--help"]
     environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     result = subprocess.run(command, env=environ, capture_output=True)
-    assert result.returncode == 0 and b"--learning-rate" in result.stdout.replace(b"--actor-l", b"--l"), result.stderr
+    assert result.returncode == 0 and b"--num-iterations" in result.stdout, result.stderr
 
 
 def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
@@ -376,12 +377,11 @@ def interrupt_acting(module):
 
 
 def test_evaluations_take_the_cores_they_may_use(script):  # noqa: F811
-    module = importlib.import_module(script)
-    config = module.Config(device="cpu", env_id=[*TASK[script], "CartPole-v1"][1 if TASK[script] else 0])
+    config = importlib.import_module(script).Config(device="cpu")
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:
-        with common.Run(config, script, gym.spec(config.env_id), module.evaluate):
+        with common.Run(config, script, None, None):
             assert len(multiprocessing.active_children()) == 1
     finally:
         os.sched_setaffinity(0, allowed)

@@ -286,7 +286,7 @@ def test_several_seeds_in_processes_of_a_script_of_their_own(script, tmp_path):
 def train_seeds(module):
     def main():
         values = {"num_iterations": 10**6, "initial_collect_steps": 96, "batch_size": 24, "log_interval": 20}
-        values |= {"env_id": TASK[module.__name__][1]} if TASK[module.__name__] else {}
+        values |= dict(zip(["env_id"], TASK[module.__name__][1:]))
         path, processes = Path(sys.argv[1]), []
         for seed in range(2):
             config = module.Config(seed=seed, run_dir=path / f"{seed}", num_eval_episodes=1, device="cpu", **values)
