@@ -495,7 +495,7 @@ class Run:
             task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
             self.pool = futures.ProcessPoolExecutor(workers, context, _start_evaluator, (task,))
             self.stack.callback(self.pool.shutdown)
-            self.pool.submit(int).result()  # starts the workers: now, before anything uses a GPU or starts threads
+            list(self.pool.map(int, range(workers)))  # starts all: now, before anything uses a GPU or starts threads
             for worker in set(multiprocessing.active_children()).difference(others):
                 self.stack.callback(worker.kill)
         keep_freed_memory()
@@ -515,14 +515,15 @@ class Run:
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         program = Path(sys.modules[type(self.config).__module__].__file__).name
-        return f"to continue from the last checkpoint: {python} {program} --resume {shlex.quote(str(self.path))}"
+        arguments = shlex.join([program, "--resume", str(self.path)])
+        return f"to continue from the last checkpoint: {python} {arguments}"
 
     def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
             os._exit(130)  # the workers notice and follow
         self.stopping = True
-        with contextlib.suppress(OSError):
-            os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
+        with contextlib.suppress(Exception):  # no console
+            os.write(sys.stderr.fileno(), b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
 
     def stop_requested(self, step):
         """Whether any rank was asked to stop. Several processes exchange messages for it, so not at every step."""
@@ -644,11 +645,10 @@ class Run:
         policy = policy and copy.deepcopy(policy).cpu()
         seeds = [(seed,) for seed in evaluation_seeds(self.config)]
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
-        while not self.stopping and futures.wait(episodes, timeout=0.1).not_done:
-            pass
+        while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
+            for episode in under_way.done:
+                episode.result()  # raises what went wrong
         if self.stopping:
-            for episode in episodes:
-                episode.cancel()
             return
         row, text = summarize([episode.result() for episode in episodes])
         self._log(table, step, env_steps, row)
@@ -706,7 +706,7 @@ class Run:
         title = f"{self.config.env_id}, seed {self.config.seed}"
         with or_warn("learning_curve.png", self.print):
             plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
-        if self.stopped or self.stopping:  # the latter in the last evaluation, which is then still to be done
+        if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:
@@ -767,6 +767,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
+    os.environ.pop("MPLBACKEND", None)  # it draws without one, and a notebook's may not even be installed
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")

@@ -171,11 +171,9 @@ def _serve():
     import tyro
     from torch.utils.tensorboard import SummaryWriter  # noqa: F401
 
-    import common
-
     # Done once, these import much and fill caches.
     matplotlib.figure.Figure().savefig(io.BytesIO(), format="png")
-    torch.export.save(common.PolicyFile(torch.nn.Linear(1, 1), (1,)).program, io.BytesIO())
+    torch.export.save(torch.export.export(torch.nn.Linear(1, 1), (torch.ones(2, 1),)), io.BytesIO())
     for script in SCRIPTS:
         tyro.cli(importlib.import_module(script).Config, args=[])
     while True:

@@ -1,6 +1,5 @@
 """Several processes train one agent: on the CPU, over gloo, started as torchrun does or by torchrun itself."""
 
-import importlib
 import os
 import signal
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 import torch
 
 import common
-from runs import AGENTS, ROOT, SCRIPTS, assert_same, checkpoint, flags, rows, session, start_ranks, wait_until
+from runs import AGENTS, ROOT, SCRIPTS, Process, assert_same, checkpoint, flags, rows, session, start_ranks, wait_until
 from test_resume import assert_same_run, before_update, die
 
 
@@ -25,15 +24,20 @@ def end(ranks, statuses=None):
 
 
 def new_agent(module, ranks):
-    """A tiny agent whose critics do not move, so that the actor's gradients are those of the same critics."""
+    """A tiny agent whose critics do not move, so that the actor's gradients are those of the same critics.
+
+    Nor do they normalize: each process does that within its own share.
+    """
     torch.manual_seed(0)
     if module.__name__ == "dqn_cartpole":
-        config = module.Config(layers=(16,))
+        config, more = module.Config(layers=(16,)), ()
     else:
-        config = module.Config(env_id="Pendulum-v1", actor_layers=(16,), critic_layers=(16,), critic_learning_rate=0.0)
+        still = {"critic_learning_rate": 0.0, "critic_batch_norm": False}
+        config = module.Config(env_id="Pendulum-v1", actor_layers=(16,), critic_layers=(16,), **still)
+        more = (3,)
     with gym.make(config.env_id) as env:
         spaces = env.observation_space, env.action_space
-    return getattr(module, AGENTS[module.__name__])(config, *spaces, torch.device("cpu"), ranks)
+    return getattr(module, AGENTS[module.__name__])(config, *spaces, *more, torch.device("cpu"), ranks)
 
 
 def joined_batch(module):
@@ -51,12 +55,11 @@ def gradients_of_update(module, ranks):
     batch = [part[ranks.rank :: ranks.world_size] for part in joined_batch(module)]
     if module.__name__ == "dqn_cartpole":
         agent.fit_offset(batch[2])
-        agent.update(batch, 10.0)
+        agent.update(batch, 0, 10.0)
     else:
         agent.fit_scaling(batch[0], batch[2])
         agent.update(batch)
-    groups = [g for name, o in vars(agent).items() if name.endswith("optimizer") for g in o.param_groups]
-    return [parameter.grad for group in groups for parameter in group["params"]]
+    return [p.grad for optimizer in agent.optimizers for group in optimizer.param_groups for p in group["params"]]
 
 
 def save_gradients(module, directory):
@@ -96,7 +99,7 @@ def save_agent_at(module, directory, count):
     def update_and_save(self, *arguments):
         metrics = update(self, *arguments)
         if next(calls) == count:
-            torch.save(self.state(), f"{directory}/{self.ranks.rank}.pt")
+            torch.save(self.state_dict(), f"{directory}/{self.ranks.rank}.pt")
         return metrics
 
     agent_class.update = update_and_save
@@ -132,7 +135,7 @@ def stopped(request, tmp_path_factory):
 
 def test_all_ranks_stop_with_one(stopped):
     state = checkpoint(stopped)
-    assert 0 < state["shared"]["step"] < 10**6 and len(state["ranks"]) == 2
+    assert 0 < state["step"] < 10**6 and len(state["ranks"]) == 2
 
 
 def test_every_rank_has_experience_of_its_own(stopped):
@@ -168,20 +171,6 @@ def test_collect_ratio_holds_over_all_ranks(trained):
         assert 96 + 2 * step <= env_steps < 96 + 2 * step + 2 * (2 * world_size), (step, env_steps)
 
 
-def test_evaluation_does_not_depend_on_how_it_is_shared(trained, tmp_path):
-    """Every episode of a fixed list is played once: the final policy's row is what one process gets."""
-    run_dir, _, _ = trained
-    script = checkpoint(run_dir)["script"]
-    module = importlib.import_module(script)
-    config = checkpoint(run_dir)["shared"]["config"]
-    policy = torch.export.load(run_dir / "policy.pt2").module()
-    seeds = [common.episode_seed(config["seed"], common.EVALUATION_KEY, i) for i in range(2)]
-    returns, _ = zip(*(module.evaluate(policy, config["env_id"], seed) for seed in seeds))
-    header, *_, last = rows(run_dir / "eval.csv")
-    assert last[0] == "240"
-    assert float(last[header.index("average_return")]) == pytest.approx(sum(returns) / 2, rel=1e-4)
-
-
 def test_killed_and_resumed_exactly_with_as_many_processes(trained, tmp_path):
     run_dir, _, world_size = trained
     script = checkpoint(run_dir)["script"]
@@ -189,9 +178,10 @@ def test_killed_and_resumed_exactly_with_as_many_processes(trained, tmp_path):
     # The others lose it, say so, and end, without anybody to end them.
     assert [rank.wait() for rank in ranks] == [1, -signal.SIGKILL, 1][:world_size]
     assert ranks[0].stderr.startswith("error: lost another process") and ranks[0].stderr.count("\n") == 1
-    assert 0 < checkpoint(tmp_path / "run")["shared"]["step"] < 240
-    with pytest.raises(common.InputError, match=f"saved by {world_size} processes"):
-        common.load_checkpoint(tmp_path / "run" / "checkpoint.pt", script, common.Ranks(0, 5 - world_size))
+    assert 0 < checkpoint(tmp_path / "run")["step"] < 240
+    alone = Process(script, ["--resume", tmp_path / "run"], tmp_path / "alone")
+    end([alone], [2])
+    assert f"saved by {world_size} processes" in alone.stderr and alone.stderr.count("\n") == 1
     end(start_ranks(world_size, script, ["--resume", tmp_path / "run"], tmp_path / "2"))
     assert_same_run(tmp_path / "run", run_dir)
 
@@ -242,7 +232,7 @@ def test_torchrun_ends_when_a_rank_is_killed(tmp_path):
     assert process.returncode != 0
     assert "error: lost another process" in errors or "SIGKILL" in errors
     wait_until(lambda: not session(ranks["0"]) and not session(ranks["1"]), seconds=60)  # one session per rank
-    assert "shared" in checkpoint(tmp_path / "run")
+    assert len(checkpoint(tmp_path / "run")["ranks"]) == 2
 
 
 def rank_of(pid):

@@ -1,18 +1,20 @@
-"""Damaged and hostile files, full disks, dead workers, losses that are not numbers: one line, and nothing is lost."""
+"""Damaged and hostile files, full disks, dead workers, odd consoles, losses that are not numbers: one line."""
 
-import contextlib
 import importlib
 import io
-import json
+import multiprocessing
 import os
 import pickle
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import zipfile
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import gymnasium as gym
@@ -22,36 +24,27 @@ import pytest
 import torch
 
 import common
-from runs import SCRIPTS, TASK, Process, checkpoint, flags, rows, session, wait_until
+from runs import ROOT, SCRIPTS, Process, checkpoint, flags, rows, session, wait_until
 from test_resume import assert_same_run, before_call, before_update, die, finish, interrupt
 from test_resume import reference, script  # noqa: F401 (fixtures)
 
 
 def assert_one_line(run, status, *words):
-    assert run.wait() == status, (run.stdout, run.stderr)
+    assert run.wait(60) == status, (run.stdout, run.stderr)
     lines = run.stderr.strip().split("\n")
     assert len(lines) == 1 and lines[0].startswith("error: "), run.stderr
     assert all(word in lines[0] for word in words), lines[0]
 
 
+def refusal(script, *arguments):  # noqa: F811
+    """The one line that refuses this command line."""
+    argv = mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)])
+    with argv, pytest.raises(common.InputError, match="^[^\n]*$") as error:
+        common.read_command_line(importlib.import_module(script).Config, "", script)
+    return str(error.value)
+
+
 # Files
-
-
-def rewrite(source, target, records):
-    """Copies a zip archive with the records given replaced or added."""
-    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as copy:
-        root = archive.namelist()[0].partition("/")[0]
-        records = {f"{root}/{name}": data for name, data in records.items()}
-        for name in archive.namelist():
-            if name not in records:
-                copy.writestr(name, archive.read(name))
-        for name, data in records.items():
-            copy.writestr(name, data)
-
-
-def read(path, name):
-    with zipfile.ZipFile(path) as archive:
-        return archive.read(f"{archive.namelist()[0].partition('/')[0]}/{name}")
 
 
 class CreatesFile:
@@ -64,8 +57,8 @@ class CreatesFile:
         return open, (str(self.path), "w")
 
 
-def saved(*objects):
-    torch.save(objects if len(objects) > 1 else objects[0], buffer := io.BytesIO())
+def saved(value):
+    torch.save(value, buffer := io.BytesIO())
     return buffer.getvalue()
 
 
@@ -78,23 +71,23 @@ def flip_a_byte(path):
     path.write_bytes(data)
 
 
-def truncate(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+def change(path, **values):
+    torch.save(torch.load(path, weights_only=True) | values, path)
 
 
 DAMAGES = {
-    "truncated": truncate,
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "a flipped bit": flip_a_byte,
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("a shopping list\n"),
     "a pickle": lambda path: path.write_bytes(pickle.dumps({"format": 1})),
     "another archive": lambda path: path.write_bytes(saved({"weights": torch.zeros(3)})),
     "a list": lambda path: path.write_bytes(saved([1, 2])),
+    "another script's": partial(change, script="td3_ant"),
+    "another format": partial(change, format=0),
+    "another kind": partial(change, kind="video"),
+    "missing": Path.unlink,
 }
-
-
-def change(path, **values):
-    torch.save(torch.load(path, weights_only=True) | values, path)
 
 
 @pytest.fixture
@@ -103,117 +96,54 @@ def copy(reference, tmp_path):  # noqa: F811
     return shutil.copytree(reference, tmp_path / "run")
 
 
-def test_damaged_or_foreign_checkpoint(script, copy, tmp_path):  # noqa: F811
-    whole = (copy / "checkpoint.pt").read_bytes()
-    foreign = {"script": partial(change, script="td3_ant"), "format": partial(change, format=0)}
-    for name, damage in (DAMAGES | foreign | {"missing": Path.unlink}).items():
-        (copy / "checkpoint.pt").write_bytes(whole)
-        damage(copy / "checkpoint.pt")
-        with pytest.raises(common.InputError, match="checkpoint.pt") as error:
-            common.load_checkpoint(copy / "checkpoint.pt", script, common.Ranks())
-        assert "\n" not in str(error.value), name
-    assert_one_line(Process(script, ["--resume", copy], tmp_path / "missing"), 2, "checkpoint.pt")
+@pytest.mark.parametrize("name", ["checkpoint.pt", "policy.pt"])
+def test_damaged_or_foreign_file(script, copy, tmp_path, name):  # noqa: F811
+    whole, created = (copy / name).read_bytes(), tmp_path / "created"
+    hostile = {
+        "a hostile value": lambda path: path.write_bytes(saved({"format": CreatesFile(created)})),
+        "a hostile pickle": lambda path: path.write_bytes(pickle.dumps(CreatesFile(created))),
+    }
+    arguments = ["--resume", copy] if name == "checkpoint.pt" else ["--evaluate", copy / name]
+    for what, damage in (DAMAGES | hostile).items():
+        (copy / name).write_bytes(whole)
+        damage(copy / name)
+        assert str(copy / name) in refusal(script, *arguments), what
+        assert not created.exists(), what
+    assert_one_line(Process(script, arguments, tmp_path / "output"), 2, name)
 
 
-def test_checkpoint_of_another_version(script, copy, tmp_path):  # noqa: F811
+def test_checkpoint_of_another_version(script, copy):  # noqa: F811
     """It has a field more or one less: what that would have to be, nobody knows."""
-    path = copy / "checkpoint.pt"
-    state = torch.load(path, weights_only=True)
-    config = state["shared"]["config"]
+    config = checkpoint(copy)["config"]
     older = {name: value for name, value in config.items() if name != "observation_scaling"}
     for changed, field in ((older, "observation_scaling"), (config | {"wings": 2}, "wings")):
-        torch.save(state | {"shared": state["shared"] | {"config": changed}}, path)
-        assert_one_line(Process(script, ["--resume", copy], tmp_path / field), 2, "checkpoint.pt", "version", field)
+        change(copy / "checkpoint.pt", config=changed)
+        message = refusal(script, "--resume", copy)
+        assert "another version" in message and field in message
 
 
-def test_one_script_does_not_continue_the_other(script, reference, tmp_path):  # noqa: F811
+def test_one_script_does_not_continue_the_other(script, reference):  # noqa: F811
     other = SCRIPTS[1 - SCRIPTS.index(script)]
-    assert_one_line(Process(other, ["--resume", reference], tmp_path / "resume"), 2, f"checkpoint of {script}")
-    run = Process(other, ["--evaluate", reference / "policy.pt2", "--no-video", *TASK[other]], tmp_path / "evaluate")
-    assert_one_line(run, 2, "policy.pt2", "--env-id")
+    assert f"is a checkpoint of {script}" in refusal(other, "--resume", reference)
+    assert f"is a policy of {script}" in refusal(other, "--evaluate", reference / "policy.pt")
 
 
-def test_damaged_or_foreign_policy(script, copy, tmp_path):  # noqa: F811
-    path = copy / "policy.pt2"
-    whole = path.read_bytes()
-    cases = DAMAGES | {"a checkpoint": lambda path: shutil.copy(copy / "checkpoint.pt", path)}
-    for name, damage in cases.items():
-        path.write_bytes(whole)
-        damage(path)
-        with pytest.raises(common.InputError, match="policy.pt2") as error:
-            common.load_weights(path)
-        assert "\n" not in str(error.value), name
-    assert_one_line(Process(script, ["--evaluate", path], tmp_path / "evaluate"), 2, "policy.pt2")
-    with pytest.raises(common.InputError, match="no.pt2 does not exist"):
-        common.load_weights(tmp_path / "no.pt2")
+def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):  # noqa: F811
+    """Its file says on what task and on which episodes. The exported one does the same."""
+    run = finish(script, ["--evaluate", reference / "policy.pt", "--no-video"], tmp_path / "output")
+    header, *_, last = rows(reference / "eval.csv")
+    assert f"AverageReturn = {float(last[header.index('average_return')]):.6f} " in run.stdout
+    other_task = ["--evaluate", reference / "policy.pt", "--no-video", "--env-id"]
+    other_task.append("MountainCar-v0" if script == "dqn_cartpole" else "MountainCarContinuous-v0")
+    assert_one_line(Process(script, other_task, tmp_path / "other"), 2, "policy.pt", "does not fit MountainCar")
 
-
-def test_whole_policy_is_evaluated(script, reference, tmp_path):  # noqa: F811
-    arguments = ["--evaluate", reference / "policy.pt2", "--no-video", "--num-eval-episodes", 1, *TASK[script]]
-    assert "AverageReturn = " in finish(script, arguments, tmp_path / "output").stdout
     module = importlib.import_module(script)
-    weights = common.load_weights(reference / "policy.pt2")
-    with module.make_env(checkpoint(reference)["shared"]["config"]["env_id"]) as env:
-        policy = module.make_policy(weights, env.observation_space, env.action_space)
+    file = common.read_file(reference / "policy.pt", "policy", script)
+    with gym.make(file["config"]["env_id"]) as env:
+        policy = module.Policy(module.Config(**file["config"]), env.observation_space, env.action_space)
         observations = torch.randn(50, *env.observation_space.shape)
+    policy.load_state_dict(file["weights"])
     assert torch.equal(policy(observations), torch.export.load(reference / "policy.pt2").module()(observations))
-
-
-def test_hostile_checkpoint_is_not_executed(reference, tmp_path):  # noqa: F811
-    created = tmp_path / "created"
-    state = torch.load(reference / "checkpoint.pt", weights_only=True)
-    for data in (saved(state | {"format": CreatesFile(created)}), pickle.dumps(CreatesFile(created))):
-        (tmp_path / "checkpoint.pt").write_bytes(data)
-        with pytest.raises(common.InputError):
-            common.load_checkpoint(tmp_path / "checkpoint.pt", "sac_minitaur", common.Ranks())
-        assert not created.exists()
-
-
-def hostile_policies(path, created):
-    """(name, bytes) of policies that would create a file when PyTorch loads and calls them."""
-    evil, python = CreatesFile(created), f"__import__('os').open({str(created)!r}, 64)"
-    graph = json.loads(read(path, "models/model.json"))
-    weights = json.loads(read(path, "data/weights/model_weights_config.json"))
-    next(iter(weights["config"].values()))["use_pickle"] = True
-    records = {
-        "sample inputs": {"data/sample_inputs/model.pt": saved((evil,))},
-        "guard": {"models/model.json": json.dumps(graph | {"guards_code": [python]})},
-        "pickled weight": {
-            "data/weights/model_weights_config.json": json.dumps(weights),
-            "data/weights/weight_0": saved(evil),
-        },
-        "weights of an old format": {"data/weights/model.pt": saved(evil)},
-        "constants of an old format": {"data/constants/model.pt": saved(evil)},
-    }
-    for name, replaced in records.items():
-        rewrite(path, target := path.with_name("hostile.pt2"), replaced)
-        yield name, target.read_bytes()
-    with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:  # the format before PyTorch 2.8
-        archive.writestr("version", f"{graph['schema_version']['major']}.{graph['schema_version']['minor']}")
-        archive.writestr("serialized_exported_program.json", json.dumps(graph))
-        for part in ("state_dict", "constants", "example_inputs"):
-            archive.writestr(f"serialized_{part}.pt", saved(evil))
-    yield "old format", buffer.getvalue()
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_hostile_policy_is_not_executed(script, reference, tmp_path):  # noqa: F811
-    """PyTorch's own loader shows that each of the files does create one."""
-    observations = torch.zeros(2, 3 if script == "sac_minitaur" else 4)
-    path, created = tmp_path / "policy.pt2", tmp_path / "created"
-    for name, data in hostile_policies(shutil.copy(reference / "policy.pt2", path), created):
-        (tmp_path / "hostile.pt2").write_bytes(data)
-        with contextlib.suppress(common.InputError):  # or only its weights were looked at
-            common.load_weights(tmp_path / "hostile.pt2")
-        assert not created.exists(), name
-        with contextlib.suppress(Exception):
-            torch.export.load(tmp_path / "hostile.pt2").module()(observations)
-        assert created.exists(), name
-        created.unlink()
-    path.write_bytes(pickle.dumps(CreatesFile(created)))
-    with pytest.raises(common.InputError):
-        common.load_weights(path)
-    assert not created.exists()
 
 
 # Disks
@@ -244,9 +174,8 @@ def test_full_disk(script, small_disk, reference, tmp_path):  # noqa: F811
     """The run says so and stops. With room again it continues, to the same end."""
     hook = partial(fill_disk, path=small_disk / "other people's")
     run = Process(script, flags(script, small_disk / "run", "--num-envs", 2), tmp_path / "output", hook)
-    assert_one_line(run, 1, "No space left on device", "checkpoint is kept")
-    state = checkpoint(small_disk / "run")
-    assert 0 < state["shared"]["step"] < 300
+    assert_one_line(run, 1, "No space left on device; to continue from the last checkpoint: python ", " --resume ")
+    assert 0 < checkpoint(small_disk / "run")["step"] < 300
     for path in (small_disk / "run").glob("*.csv"):
         rows(path)
     (small_disk / "other people's").unlink()
@@ -265,6 +194,48 @@ def test_full_disk_from_the_start(script, small_disk, tmp_path):  # noqa: F811
     assert run.status and len(run.stderr.strip().split("\n")) == 1, run.stderr
 
 
+def test_files_are_whole_or_not_there(tmp_path):
+    """A write that the disk has room for in part only, also one by PyTorch, which raises an error of its own."""
+    path = tmp_path / "train.csv"
+    common.write_atomically(path, lambda file: file.write(b"step,loss\n1,2\n"))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
+    try:
+        for write in (lambda file: file.write(bytes(100)), partial(torch.save, torch.zeros(9))):
+            with pytest.raises(OSError):
+                common.write_atomically(path, write)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == b"step,loss\n1,2\n" and list(tmp_path.iterdir()) == [path]
+
+
+def test_runs_that_start_at_once_have_directories_of_their_own(script):  # noqa: F811
+    config = importlib.import_module(script).Config(device="cpu")
+    runs = [common.Run(config, script, None, None) for _ in range(2)]
+    assert runs[0].path != runs[1].path and runs[0].path.parent == runs[1].path.parent == Path("runs")
+
+
+def test_one_directory_for_two_runs_that_start_at_once(tmp_path):
+    (tmp_path / "ready").mkdir()
+    hook = partial(wait_for_the_other, path=tmp_path / "ready")
+    arguments = flags("dqn_cartpole", tmp_path / "run", "--num-iterations", 20)
+    runs = [Process("dqn_cartpole", arguments, tmp_path / f"{i}", hook) for i in range(2)]
+    refused, trained = sorted(runs, key=lambda run: -run.wait())
+    assert_one_line(refused, 2, f"--run-dir {tmp_path}/run cannot be used")
+    assert trained.status == 0 and checkpoint(tmp_path / "run")["step"] == 20
+
+
+def wait_for_the_other(module, path):
+    def wait():
+        (path / str(os.getpid())).touch()
+        wait_until(lambda: len(list(path.iterdir())) == 2, 60)
+
+    before_call(common.Run, "_start_files", 1, wait)
+
+
+# Consoles
+
+
 def test_console_on_a_full_disk(script, tmp_path):  # noqa: F811
     run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", print_to_a_full_disk)
     assert_one_line(run, 1, "No space left")
@@ -274,18 +245,84 @@ def print_to_a_full_disk(module):
     os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
 
 
-def test_rows_are_whole_or_not_there(tmp_path):
-    """A write that the disk has room for in part only."""
-    path = tmp_path / "train.csv"
-    common.append_whole(path, b"step,loss\n1,2\n")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
-    try:
-        with pytest.raises(OSError):
-            common.append_whole(path, b"2," + b"3" * 100 + b"\n")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == b"step,loss\n1,2\n"
+def lose_the_reader(module):
+    """As after `| head`, in the midst of it."""
+
+    def lose_it():
+        reader, writer = os.pipe()
+        os.dup2(writer, 1)
+        os.close(reader)
+
+    before_update(module, 50, lose_it)
+
+
+def close_stdout(module):
+    """As `>&-`: Python then has None in its place."""
+    os.close(1)
+    sys.stdout = None
+
+
+def replace_stderr(module):
+    sys.stderr = SimpleNamespace(write=len, flush=lambda: None)
+
+
+def have_no_streams(module):
+    """As pythonw."""
+    os.close(1)
+    os.close(2)
+    sys.stdout = sys.stderr = None
+
+
+@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams])
+def test_trains_on_without_a_console(tmp_path, hook):
+    run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
+    assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
+    assert (tmp_path / "run" / "best_policy.pt2").exists()
+
+
+def test_stops_without_a_console(tmp_path):
+    """The message about it goes to no file that has taken the closed console's number."""
+    finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", have_no_streams_and_stop)
+    assert checkpoint(tmp_path / "run")["step"] == 50
+    assert not any(b"Ctrl-C" in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
+
+
+def have_no_streams_and_stop(module):
+    have_no_streams(module)
+
+    def reuse_their_numbers_and_stop():
+        while os.open(Path(sys.argv[-1]) / "notes", os.O_WRONLY | os.O_CREAT) < 2:
+            pass
+        interrupt()
+
+    before_update(module, 50, reuse_their_numbers_and_stop)
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437"])
+def test_console_that_cannot_show_everything(script, encoding):  # noqa: F811
+    command = [sys.executable, ROOT / f"{script}.py", "--help"]
+    environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
+    result = subprocess.run(command, env=environ, capture_output=True)
+    assert result.returncode == 0 and b"--num-iterations" in result.stdout, result.stderr
+
+
+def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
+    """The hint after a stop names it and quotes the path. A notebook's backend and console do not matter."""
+    shutil.copy(ROOT / "dqn_cartpole.py", tmp_path / "my dqn.py")
+    environ = os.environ | {
+        "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0", "PYTHONIOENCODING": "cp437",
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+    }  # fmt: skip
+    arguments = flags("dqn_cartpole", "a run", "--num-iterations", 10**6)
+    command = [sys.executable, "my dqn.py", *arguments]
+    process = subprocess.Popen(command, env=environ, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    wait_until((tmp_path / "a run" / "train.csv").exists, 60)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0 and "warning" not in output
+    assert (tmp_path / "a run" / "learning_curve.png").stat().st_size > 0
+    hint = output.splitlines()[-1].partition("checkpoint: ")[2]
+    assert shlex.split(hint) == ["python", "my dqn.py", "--resume", "a run"]
 
 
 # Processes. `Process.wait` asserts each time that nothing of the run has outlived it.
@@ -295,7 +332,7 @@ def test_dead_environment_worker(tmp_path):
     arguments = flags("sac_minitaur", tmp_path / "run", "--num-envs", 2)
     run = Process("sac_minitaur", arguments, tmp_path / "output", kill_environment)
     assert_one_line(run, 1, "worker process died", "--resume")
-    assert checkpoint(tmp_path / "run")["shared"]["step"] == 0
+    assert checkpoint(tmp_path / "run")["step"] == 0
 
 
 def kill_environment(module):
@@ -311,14 +348,59 @@ def kill_environment(module):
 
 
 def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
-    # Networks larger than a pipe: what is queued for the dead worker must not hold up the end.
+    """With a network larger than a pipe: what is queued for the dead one must not hold up the end."""
     large = ["--layers" if script == "dqn_cartpole" else "--actor-layers", 256, 256, "--num-eval-episodes", 20]
     run = Process(script, flags(script, tmp_path / "run", *large), tmp_path / "output", die_evaluating)
-    assert_one_line(run, 1, "worker process died", "--resume")
+    assert_one_line(run, 1, "worker process died; to continue from the last checkpoint: ")
 
 
 def die_evaluating(module):
-    before_call(module, "act", 3, die)
+    before_call(module.Policy, "act", 3, die)
+
+
+def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
+    """Which is killed in the midst of everything, while its workers work."""
+    run = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "output")
+    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    assert len(session(run.pid)) > 1
+    run.kill()
+    assert run.wait() == -signal.SIGKILL
+
+
+def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):  # noqa: F811
+    run = Process(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", interrupt_acting)
+    assert run.wait() == 130 and not run.stderr
+
+
+def interrupt_acting(module):
+    before_call(module.Policy, "act", 3, interrupt)
+
+
+def test_evaluations_take_the_cores_they_may_use(script):  # noqa: F811
+    config = importlib.import_module(script).Config(device="cpu")
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        with common.Run(config, script, None, None):
+            assert len(multiprocessing.active_children()) == 1
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def test_processes_that_cannot_train(script, tmp_path):  # noqa: F811
+    run = Process(script, [], tmp_path / "pool", train_in_a_pool)
+    assert_one_line(run, 2, "use multiprocessing.Process")
+    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "rank", RANK="0", WORLD_SIZE="2", LOCAL_RANK="0")
+    assert_one_line(run, 2, "RANK is set but MASTER_ADDR is not", "torchrun")
+    assert not (tmp_path / "run").exists()
+
+
+def train_in_a_pool(module):
+    config = module.Config(env_id="Pendulum-v1" if module.__name__ == "sac_minitaur" else "CartPole-v1")
+    module.main = lambda: multiprocessing.Pool(1).map(module.train, [config])
+
+
+# Films
 
 
 def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
@@ -334,7 +416,12 @@ def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
 class Blinking(gym.Env):
     """Thirty steps at 120 a second."""
 
-    metadata = {"render_fps": 120}
+    metadata = {"render_fps": 120, "render_modes": ["rgb_array"]}
+    action_space, observation_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+    closed = 0
+
+    def __init__(self, render_mode, failing=False):
+        self.render_mode, self.failing = render_mode, failing
 
     def reset(self, *, seed=None, options=None):
         self.steps = 0
@@ -345,11 +432,21 @@ class Blinking(gym.Env):
         return 0, 0.0, self.steps == 30, False, {}
 
     def render(self):
+        if self.failing and self.steps > 5:
+            raise ValueError
         return np.full((16, 16, 3), 8 * self.steps, np.uint8)
+
+    def close(self):
+        Blinking.closed += 1
+
+
+def film(path, **arguments):
+    task = gym.envs.registration.EnvSpec("Blinking-v0", Blinking, disable_env_checker=True, kwargs=arguments)
+    common.film(None, task, 0, path)
 
 
 def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
-    common.record_video(tmp_path / "film.mp4", Blinking(), lambda observation: 0, seed=0)
+    film(tmp_path / "film.mp4")
     with imageio.get_reader(tmp_path / "film.mp4") as video:
         brightness = [frame.mean() for frame in video]
         assert video.get_meta_data()["fps"] == 40
@@ -357,65 +454,22 @@ def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_a_video_that_fails_leaves_nothing(tmp_path):
-    env = Blinking()
-    env.close = mock.Mock()
-    with mock.patch.object(env, "render", side_effect=[np.zeros((16, 16, 3), np.uint8), ValueError]):
-        with pytest.raises(ValueError):
-            common.record_video(tmp_path / "film.mp4", env, lambda observation: 0, seed=0)
-    env.close.assert_called_once_with()
-    assert not any(tmp_path.iterdir())
+def test_a_film_that_fails_leaves_nothing(tmp_path):
+    closed = Blinking.closed
+    with pytest.raises(ValueError):
+        film(tmp_path / "film.mp4", failing=True)
+    assert Blinking.closed == closed + 1 and not any(tmp_path.iterdir())
 
 
-def test_failing_video_costs_a_line_only(script, tmp_path):  # noqa: F811
+def test_failing_film_costs_a_line_only(script, tmp_path):  # noqa: F811
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = finish(script, arguments, tmp_path / "output", die_filming)
-    assert "warning: no video" in run.stdout and not run.stderr
-    assert (tmp_path / "run" / "learning_curve.png").exists()
+    assert "warning: no trained_agent.mp4" in run.stdout and not run.stderr
+    assert (tmp_path / "run" / "policy.pt2").exists()
 
 
 def die_filming(module):
-    before_call(common, "record_video", 1, die)
-
-
-def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
-    """Which is killed in the midst of everything, while its workers work."""
-    run = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "output")
-    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
-    assert len(session(run.pid)) > 1
-    run.kill()
-    assert run.wait() == -signal.SIGKILL
-
-
-def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):  # noqa: F811
-    arguments = ["--evaluate", reference / "policy.pt2", *TASK[script]]
-    run = Process(script, arguments, tmp_path / "output", interrupt_acting)
-    assert run.wait() == 130 and not run.stderr
-
-
-def interrupt_acting(module):
-    before_call(module, "act", 3, interrupt)
-
-
-def test_runs_that_start_at_once_have_directories_of_their_own(script, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.chdir(tmp_path)
-    config = importlib.import_module(script).Config(device="cpu", num_eval_episodes=1)
-    runs = [common.Run(config, script, len) for _ in range(2)]
-    for run in runs:
-        run.evaluations.close()
-    assert runs[0].path != runs[1].path and runs[0].path.parent == runs[1].path.parent == Path("runs")
-
-
-def test_evaluations_take_the_cores_they_may_use():
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})
-    try:
-        evaluations = common.Evaluations(len, "", range(8), common.Ranks())
-    finally:
-        os.sched_setaffinity(0, allowed)
-    workers = len(evaluations.pool._processes)
-    evaluations.close()
-    assert workers == 1
+    before_call(imageio, "get_writer", 1, die)
 
 
 # Losses
@@ -436,20 +490,13 @@ def with_nan_rewards(module):
     module.make_training_env = lambda *args: NanReward(make_training_env(*args))
 
 
-def test_loss_that_is_not_a_number(script, tmp_path):  # noqa: F811
-    """Stops the run at once, with the step and the part, and no checkpoint has taken it in."""
+@pytest.mark.parametrize("log_interval, name", [(1, "loss is nan"), (10**6, "is not finite")])
+def test_loss_that_is_not_a_number(script, tmp_path, log_interval, name):  # noqa: F811
+    """Stops the run when it is logged or saved, with the step and the part, and no checkpoint has taken it in."""
     few = ["--initial-collect-steps", 26, "--checkpoint-interval", 1, "--eval-interval", 10**6]
-    run = Process(script, flags(script, tmp_path / "run", *few), tmp_path / "output", with_nan_rewards)
-    assert_one_line(run, 1, "loss is nan at step ", "checkpoint is kept")
-    step = int(run.stderr.split("at step ")[1].split(";")[0])
-    state = checkpoint(tmp_path / "run")["shared"]
-    assert state["step"] == step - 1
-    assert all(tensor.isfinite().all() for tensor in tensors(state["agent"]) if tensor.dim())
-
-
-def tensors(tree):
-    if isinstance(tree, torch.Tensor):
-        yield tree
-    elif isinstance(tree, (dict, list, tuple)):
-        for value in tree.values() if isinstance(tree, dict) else tree:
-            yield from tensors(value)
+    arguments = flags(script, tmp_path / "run", *few, "--log-interval", log_interval)
+    run = Process(script, arguments, tmp_path / "output", with_nan_rewards)
+    assert_one_line(run, 1, f"{name} at step ", "the last good checkpoint is kept")
+    state = checkpoint(tmp_path / "run")
+    assert 0 < state["step"] == int(run.stderr.split("at step ")[1].split(";")[0]) - 1
+    assert all(tensor.isfinite().all() for name, tensor in state["agent"].items() if not name.endswith("limit"))
