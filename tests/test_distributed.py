@@ -48,7 +48,7 @@ def joined_batch(module):
 
 
 def gradients_of_update(module, ranks):
-    """The gradients that one update leaves on this rank, which has its share of the joined batch and of the first data."""
+    """The gradients that one update leaves on this rank, which has its share of the batch and of the first data."""
     torch.set_num_threads(1)
     torch.randn_like = torch.zeros_like  # the actor's samples, which ranks draw apart
     agent = new_agent(module, ranks)

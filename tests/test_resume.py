@@ -95,7 +95,7 @@ def between_policy_and_checkpoint(module):
 
 def filming(module):
     main = os.getpid()
-    before_call(imageio, "get_writer", 1, lambda: os.kill(main, signal.SIGKILL))
+    before_call(imageio, "get_writer", 1, lambda: (os.kill(main, signal.SIGKILL), time.sleep(60)))
 
 
 MOMENTS = (collecting, evaluating, updating, writing_a_checkpoint, between_policy_and_checkpoint, filming)
