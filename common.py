@@ -111,7 +111,11 @@ def read_command_line(config_class, description, script):
         saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
     if saved and (others := vars(config).keys() ^ saved["config"].keys()):
         raise InputError(f"{[*given.values()][0]} is of another version of this script, which differs in {min(others)}")
-    return tyro.cli(config_class, description=description, default=config_class(**saved.get("config", {}) | given))
+    try:
+        default = config_class(**saved.get("config", {}) | given)
+    except ValueError as error:
+        raise InputError(f"{[*given.values()][0]} has a config that is no good: {' '.join(str(error).split())}") from None
+    return tyro.cli(config_class, description=description, default=default)
 
 
 def plain_config(config):
@@ -514,7 +518,8 @@ class Run:
         if not (self.path / "checkpoint.pt").exists():
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
-        program = Path(sys.modules[type(self.config).__module__].__file__).name
+        module = sys.modules[type(self.config).__module__]  # a fork's script has a name of its own
+        program = Path(getattr(module, "__file__", f"{self.script}.py")).name
         arguments = shlex.join([program, "--resume", str(self.path)])
         return f"to continue from the last checkpoint: {python} {arguments}"
 
@@ -656,6 +661,7 @@ class Run:
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             # Five policies, closer to each other at the beginning, where most is learned.
+            require_finite(policy, step)
             weights = policy.state_dict()
             if step >= (len(self.found["snapshots"]) / 4) ** 2 * self.config.num_iterations:
                 self.found["snapshots"].append((f"{step} updates: return {row['average_return']:.1f}", weights))
@@ -665,7 +671,7 @@ class Run:
 
     def _in_pool(self, function, policy, name, arguments):
         """Futures of `function(policy, task, *arguments)` in the pool's workers, for each of these arguments."""
-        file = self.scratch / name  # the pool's own queue would send handles of shared memory
+        file = self.scratch / name  # a queue would hang at a dead worker with what is larger than a pipe
         file.write_bytes(pickle.dumps(policy))
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
@@ -683,9 +689,7 @@ class Run:
         ranks = self.ranks.gather(own)
         if not self.writes:
             return
-        for name, parameter in agent.named_parameters():
-            if not parameter.isfinite().all():
-                raise RunError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
+        require_finite(agent, step)
         state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
@@ -738,6 +742,13 @@ def or_warn(what, say):
         yield
     except Exception as error:
         say(f"warning: no {what} ({first_line(error)})")
+
+
+def require_finite(module, step):
+    """Raises RunError naming the first parameter that has a number which is not finite."""
+    for name, parameter in module.named_parameters():
+        if not parameter.isfinite().all():
+            raise RunError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
 
 
 def summarize(results):

@@ -442,7 +442,7 @@ class Blinking(gym.Env):
 
 def film(path, **arguments):
     task = gym.envs.registration.EnvSpec("Blinking-v0", Blinking, disable_env_checker=True, kwargs=arguments)
-    common.film(None, task, 0, path)
+    common.film([None], task, 0, path)
 
 
 def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
