@@ -484,7 +484,8 @@ class Run:
             changed.append("num_iterations")
         for name in changed:
             flag = f"--{name.replace('_', '-')} {config[name]}"
-            raise InputError(f"{flag} differs from the run to resume, which has {saved[name]}: leave it out")
+            what = "raise it" if name == "num_iterations" else "leave it out"
+            raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
 
@@ -577,8 +578,9 @@ class Run:
             raise InputError(f"--run-dir {self.path} cannot be used: {error.strerror}") from None
         text = json.dumps(plain_config(self.config), indent=2) + "\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
-        for path in [*self.path.glob("events.out.tfevents.*"), *(self.path / f"{table}.csv" for table in self.tables)]:
-            path.unlink(missing_ok=True)
+        for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
+            for path in self.path.glob(name):
+                path.unlink()
         from torch.utils.tensorboard import SummaryWriter  # takes a second
 
         self.summary_writer = SummaryWriter(self.path)

@@ -54,8 +54,8 @@ def gradients_of_update(module, ranks):
     agent = new_agent(module, ranks)
     batch = [part[ranks.rank :: ranks.world_size] for part in joined_batch(module)]
     if module.__name__ == "dqn_cartpole":
-        agent.fit_offset(batch[2])
-        agent.update(batch, 0, 10.0)
+        agent.fit_scaling(batch[0], batch[2])
+        agent.update(batch, 0)
     else:
         agent.fit_scaling(batch[0], batch[2])
         agent.update(batch)

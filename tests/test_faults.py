@@ -120,6 +120,8 @@ def test_checkpoint_of_another_version(script, copy):  # noqa: F811
         change(copy / "checkpoint.pt", config=changed)
         message = refusal(script, "--resume", copy)
         assert "another version" in message and field in message
+    change(copy / "checkpoint.pt", config=config | {"gamma": 2.0})
+    assert "no good" in (message := refusal(script, "--resume", copy)) and "gamma" in message
 
 
 def test_one_script_does_not_continue_the_other(script, reference):  # noqa: F811
