@@ -110,7 +110,7 @@ def read_command_line(config_class, description, script):
     elif config.evaluate is not None:
         saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
     if saved and (others := vars(config).keys() ^ saved["config"].keys()):
-        raise InputError(f"{[*given.values()][0]} is of another version of this script, which differs in {min(others)}")
+        raise InputError(f"{[*given.values()][0]} is of another version of this script: it differs in {min(others)}")
     try:
         default = config_class(**saved.get("config", {}) | given)
     except ValueError as error:

@@ -9,7 +9,7 @@
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
-"ours" in `Config`. README gives the reason for each.
+"ours" in `Config`. README gives the reasons.
 """
 
 import copy
@@ -29,7 +29,7 @@ from torch.nn import functional as F
 
 import common
 
-# That gymnasium has a v1, with 500 steps instead of the tutorial's 200, is no news here.
+# gymnasium recommends v1, which has 500 steps. The tutorial uses v0, which has 200.
 warnings.filterwarnings("ignore", ".*environment CartPole-v0 is out of date", DeprecationWarning)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -49,15 +49,15 @@ class Config:
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
     learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): updates until the learning rate is half
-    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorial leaves unsaid)
-    epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default, left unsaid)
-    gamma: Fraction = 0.99  # ours (TF-Agents' default, left unsaid: 1): discount
-    target_update_tau: Fraction = 0.05  # ours (theirs: 1): step of the target network towards the Q-network
-    value_unit: bool = True  # ours (theirs: no): the network's output counts in the worth of an endless episode
-    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): how far actions are pushed apart
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
+    epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
+    gamma: Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
+    target_update_tau: Fraction = 0.05  # ours (theirs: 1): fraction of the way that the target network moves an update
+    value_unit: bool = True  # ours (theirs: no): Q = (mean reward + mean |reward| × network's output) / (1 − γ)
+    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): weight of action_gap in a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
-    tutorial: bool = False  # set every value marked "ours" back to the tutorial's; flags given beside it still count
+    tutorial: bool = False  # set every value marked "ours" back to the tutorial's; other flags override it
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
@@ -65,7 +65,7 @@ class Config:
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
-    video: bool = True  # film the trained and the random agent at the end
+    video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 200  # updates between rows of train.csv
     eval_interval: PositiveInt = 1_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 10  # episodes per evaluation
@@ -89,7 +89,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The network
+# The network (shapes: B batch, K environments, N stored, O numbers of an observation, A actions)
 
 
 class ObservationScaling(nn.Module):
@@ -104,9 +104,9 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Leaves as they are the numbers whose bounds are a thousand times beyond all in observations (N, O)."""
-        ranks.average([reach := (observations - self.center).abs().amax(0)])
-        beyond = self.half_range > 1000 * reach
+        """Drops the bounds that are more than 1000 times the largest value in observations (N, O)."""
+        ranks.average([largest := (observations - self.center).abs().amax(0)])
+        beyond = self.half_range > 1000 * largest
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):
@@ -166,8 +166,8 @@ class Policy(nn.Module):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. Only
-    `terminated` is kept: an episode cut off by its time limit has not ended, and its last state has a value.
+    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. At a time limit
+    the episode could go on, so its last state has a value: only `terminated` marks an end.
     """
 
     def __init__(self, capacity, observation_size, device):
@@ -176,16 +176,16 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Stores K transitions: (K, O), (K,), (K,), (K,), (K,), (K, O), as numpy arrays, over the oldest when full."""
+        """Stores K transitions, numpy arrays (K, O) and (K,). A full buffer overwrites its oldest."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
-        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32, casting="unsafe"))
+        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
         for row in rows:
             self.rows[self.position].copy_(row)
             self.position = (self.position + 1) % len(self.rows)
             self.size = min(self.size + 1, len(self.rows))
 
     def sample(self, batch_size):
-        """A batch drawn uniformly with replacement: (B, O), (B,) of int64, (B,), (B,), (B, O)."""
+        """A random batch, which mixes many episodes: (B, O), (B,) of int64, (B,), (B,), (B, O)."""
         indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
         observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
@@ -213,17 +213,12 @@ def td_targets(rewards, terminated, next_q, gamma):
 
 
 def action_gap(q, actions):
-    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,). It is 0 for the best action."""
+    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,). 0 for the best action (arXiv:1512.04860)."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
 
-def td_loss(q, targets):
-    """The mean squared error: q (B,), targets (B,)."""
-    return F.mse_loss(q, targets)
-
-
 class DQNAgent(nn.Module):
-    """The Q-network with its target network and optimizer, and the greedy policy that is evaluated."""
+    """The Q-network, its slow copy for steady targets, the optimizer, and the greedy policy that is evaluated."""
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
@@ -247,33 +242,32 @@ class DQNAgent(nn.Module):
     def fit_scaling(self, observations, rewards):
         """Fixes the scales of observations and values by observations (N, O) and rewards (N,) of all ranks.
 
-        Q = (mean reward + mean |reward| × the network's output) / (1 − γ). The network starts near 0, so Q starts from
-        the worth of an endless episode, and only what ends it has to be learned.
+        An output of 0 then means the return of an endless episode. The network learns what an early end costs.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.value_unit:
-            self.ranks.average([mean := rewards.mean(), size := rewards.abs().mean()])
+            self.ranks.average([mean := rewards.mean(), mean_abs := rewards.abs().mean()])
             self.value_offset.copy_(mean / (1 - self.config.gamma))
-            self.value_scale.copy_(torch.where(size > 0, size, 1.0) / (1 - self.config.gamma))
+            self.value_scale.copy_(torch.where(mean_abs > 0, mean_abs, 1.0) / (1 - self.config.gamma))
 
     @torch.no_grad()
     def act(self, observations):
-        """Epsilon-greedy actions (K,) for flat observations (K, O), numpy to numpy."""
+        """Epsilon-greedy actions (K,) for flat observations (K, O), from numpy to numpy."""
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
         greedy = self.policy(observations).cpu().numpy()
         exploring = (torch.rand(len(greedy)) < self.config.epsilon).numpy()
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
     def q_values(self, network, observations):
-        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). The unit is ours."""
+        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). Offset and scale are ours."""
         return self.value_offset + self.value_scale * network(observations)
 
     def update(self, batch, step):
-        """One gradient step of the Q-network, then of its target, after `step` updates.
+        """Update number `step`, from 0: a gradient step of the Q-network. The target network follows it.
 
-        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
-        number back here would make a GPU wait at every step.
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: `.item()`
+        here would make the CPU wait for the GPU.
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
@@ -281,13 +275,13 @@ class DQNAgent(nn.Module):
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
-            if config.advantage_learning:  # ours: y − part × (max Q̄(s, ·) − Q̄(s, a))
+            if config.advantage_learning:  # ours: y − weight × (max Q̄(s, ·) − Q̄(s, a)), so worse actions fall further
                 y -= config.advantage_learning * action_gap(self.q_values(self.target_network, s), a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
-        loss = td_loss(q, y)  # mean (Q(s, a) − y)²
+        loss = F.mse_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
         loss.backward()
-        self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])
+        self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])  # over the processes
         if config.learning_rate_decay:  # ours: lr / (1 + (step / decay)²)
             self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         self.optimizer.step()
@@ -326,14 +320,14 @@ def make_training_env(task):
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
-    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays. A resumed run
-    equals one that was never interrupted: a checkpoint holds the agent, the replay and the random generators, and of
-    the running episodes their seeds and actions, which bring the environment back to the same state.
+    Raises InputError for an unusable config and RunError when the run fails. Saved files stay. A resumed run equals an
+    uninterrupted one: the checkpoint holds the agent, the replay, the random generators, and the seeds and actions of
+    the running episodes. The resumed run plays these again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
         batch_size = run.ranks.batch_share(config)
-        # In this process: a step of CartPole costs less than a message to a worker.
+        # In this process: a message to a worker costs more than a step of CartPole.
         envs = common.Environments(partial(make_training_env, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
@@ -341,8 +335,8 @@ def train(config):
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
         step, env_steps = run.start(agent, buffer, envs)
         if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)
-        run.evaluate(0, 0, policy=None)
+            run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
+        run.evaluate(0, 0, policy=None)  # random actions, for comparison
         while step < config.num_iterations:
             warming_up = env_steps < config.initial_collect_steps
             if step % config.eval_interval == 0 and not warming_up:
@@ -350,20 +344,20 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect, where the next update is due new experience.
+            # Collect until `due` environment steps are done. The next update follows.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.random_actions(config.num_envs) if warming_up else agent.act(envs.observations))
                 buffer.add(*envs.step_wait())
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:
+                if warming_up and env_steps >= config.initial_collect_steps:
+                    agent.fit_scaling(*buffer.observations_and_rewards())
+            if env_steps >= due and not warming_up:  # the first evaluation and the scales come before
                 metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
                 run.progress.update()
                 if step % config.log_interval == 0:
                     run.log_training(step, env_steps, envs, metrics)
-            if warming_up and env_steps >= config.initial_collect_steps:
-                agent.fit_scaling(*buffer.observations_and_rewards())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 

@@ -1,6 +1,6 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
-    python sac_minitaur.py                                    # half an hour on two quiet CPU cores, return 25 to 32
+    python sac_minitaur.py                                    # half an hour on two idle CPU cores, return 25 to 32
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt      # evaluates and films a saved policy
@@ -9,7 +9,7 @@
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
-`Config`. README gives the reason for each.
+`Config`. README gives the reasons.
 """
 
 import copy
@@ -43,38 +43,38 @@ class Config:
     initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
-    replay_buffer_capacity: PositiveInt = 1_000_000  # transitions kept by each process (2018's value; 2021: 10 000)
+    replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 10 000, in 2018 this): transitions kept
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
     actor_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for log α
-    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default, which the tutorials leave unsaid)
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
-    critic_batch_norm: bool = True  # ours (theirs: no): normalize, without target critics (CrossQ, arXiv:1902.05605)
-    target_update_tau: Fraction = 0.005  # step of the target critics, if any, towards the critics after every update
+    critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
+    target_update_tau: Fraction = 0.005  # fraction of the way that the target critics, if any, move an update
     gamma: Fraction = 0.99  # discount
-    n_step: PositiveInt = 3  # ours (theirs: 1): steps whose rewards a target sums before it bootstraps
-    reward_scaling: bool = True  # ours (theirs: no): divide rewards by the spread of the initial random data's returns
+    n_step: PositiveInt = 3  # ours (theirs: 1): rewards that a target sums before it uses the critics
+    reward_scaling: bool = True  # ours (theirs: no): divide rewards by the std of the random steps' n-step returns
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1, no average): step of the evaluated average of the actor
+    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1): the same for the evaluated policy, towards the actor
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
-    critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default, left unsaid)
-    target_entropy_per_action: float = -1.0  # ours, the paper's −|A| (TF-Agents' default, left unsaid: −|A|/2, so −0.5)
-    initial_log_alpha: float = -2.0  # ours (TF-Agents' default, left unsaid: 0)
+    critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
+    target_entropy_per_action: float = -1.0  # ours, as in the paper (theirs: −0.5): entropy that α aims at, per action
+    initial_log_alpha: float = -2.0  # ours (theirs: 0): log α at the start; α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
     observation_scaling: bool = True  # ours (theirs: no): standardize by mean and spread of the initial random data
-    tutorial: bool = False  # set every value marked "ours" back to the tutorials'; flags given beside it still count
+    tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; the physics wants another core
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; the physics uses another core
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
-    video: bool = True  # film the trained and the random agent at the end
+    video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 5_000  # updates between rows of train.csv
     eval_interval: PositiveInt = 10_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 20  # episodes per evaluation
@@ -93,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The networks
+# The networks (shapes: B batch, K environments, N stored, O observed, S seen by the critics, A per action)
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -128,7 +128,7 @@ class ObservationScaling(nn.Module):
         ranks.average([mean := observations.mean(0)])
         ranks.average([variance := (observations - mean).square().mean(0)])
         self.mean.copy_(mean)
-        # What hardly moves under random actions may move later: its deviation is not taken for less than 0.01.
+        # A number that is still under random actions may move later: its deviation counts as 0.01 or more.
         self.std.copy_(variance.sqrt().clamp(min=0.01))
         self.limit.fill_(10.0)
 
@@ -164,7 +164,7 @@ class Actor(nn.Module):
 
 
 class TwinCritics(nn.Module):
-    """Two estimates of Q(s, a), independent of each other but for their data."""
+    """Two separate estimates of Q(s, a) from the same data."""
 
     def __init__(self, observation_size, action_size, hidden_layers, batch_norm):
         super().__init__()
@@ -196,19 +196,19 @@ class Policy(nn.Module):
 
     @torch.inference_mode()
     def act(self, observation):
-        """The action for one raw observation, numpy to numpy, in the action space's own type."""
+        """The action for one raw observation, from numpy to numpy, in the action space's own type."""
         action = self(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
         require_finite(action)
         return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
 
 
 def to_bounds(action, low, high):
-    """Maps an action from [-1, 1] to [low, high]: rounding could miss the ends, and a sum of the two overflow."""
+    """Maps an action from [-1, 1] to [low, high]. The halves avoid overflow, the clip undoes rounding errors."""
     return (low / 2 + high / 2 + (high / 2 - low / 2) * action).clip(low, high)
 
 
 def require_finite(actions):
-    """Raises RunError unless all of the actions are finite: the task would meet what training has not yet noticed."""
+    """Raises RunError unless all actions are finite, before the task sees them."""
     if not np.isfinite(actions).all():
         raise common.RunError("the actor's actions are not finite: learning diverged; a smaller learning rate may help")
 
@@ -221,8 +221,8 @@ class ReplayBuffer:
 
     A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
     last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
-    time limit has not ended, and its last state has a value. Towards the end of an episode fewer than n steps are
-    left: n is then their number. Sampling is a single gather.
+    time limit has not ended, and its last state has a value. Near the end of an episode n is the number of steps left.
+    Sampling is a single gather.
     """
 
     def __init__(self, capacity, state_size, action_size, n_step, gamma, num_envs, device):
@@ -234,10 +234,7 @@ class ReplayBuffer:
         self.incomplete = [deque() for _ in range(num_envs)]
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Takes a step of each of K environments: (K, S), (K, …), (K,), (K,), (K,), (K, S), as numpy arrays.
-
-        Stores the transitions that it completes, over the oldest when full.
-        """
+        """Takes one step of each of the K environments and stores every transition that is complete."""
         for k, steps in enumerate(self.incomplete):
             steps.append((observations[k], actions[k].ravel(), rewards[k]))
             ended = terminated[k] or truncated[k]
@@ -280,8 +277,8 @@ class ReplayBuffer:
 def td_targets(returns, discounts, next_q, next_log_probs, alpha):
     """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
-    next_q (2, B), the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins' minimum and, in place of one
-    reward and γ (1 − terminated), n of them and the discount after them (the entropy of the steps between is left out).
+    next_q (2, B), alpha a scalar, the rest (B,). Equations 3 and 5 of arXiv:1812.05905 with the twins' minimum and n
+    rewards instead of one. Only the entropy at s' counts.
     """
     return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
 
@@ -307,8 +304,8 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
 class SACAgent(nn.Module):
     """Actor, twin critics and the temperature α, with their optimizers, and the policy that is evaluated.
 
-    The actor sees the task's observation, O numbers. The critics see `state_size` numbers, S: the task's first, then
-    what only they see. The policy's actor is a running average of the actor: one snapshot of the policy may fall.
+    The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: these O and the
+    privileged ones. The policy's actor is a running average of the actor, because a single snapshot may be bad.
     """
 
     def __init__(self, config, observation_space, action_space, state_size, device, ranks):
@@ -355,24 +352,24 @@ class SACAgent(nn.Module):
             self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
-    def act(self, observations, sampled):
-        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), numpy to numpy.
+    def act(self, observations, deterministic):
+        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), from numpy to numpy.
 
-        They are drawn from the actor where `sampled` (K,) is true. Elsewhere they are the evaluated policy's.
+        True in `deterministic` (K,) takes the evaluated policy's action, False samples the actor's.
         """
         observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
         actions, _ = self.actor.sample(observations)
         mean, _ = self.policy.actor(observations)
-        actions = torch.where(torch.as_tensor(sampled, device=self.device)[:, None], actions, mean.tanh())
+        actions = torch.where(torch.as_tensor(deterministic, device=self.device)[:, None], mean.tanh(), actions)
         actions = actions.view(-1, *self.action_shape).cpu().numpy()
         require_finite(actions)
         return actions
 
     def update(self, batch):
-        """One gradient step of the critics, then of the actor and α; the averages follow.
+        """One gradient step of the critics, then of the actor and α. Policy and target critics follow.
 
-        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: reading a
-        number back here would make a GPU wait at every step.
+        `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: `.item()`
+        here would make the CPU wait for the GPU.
         """
         config = self.config
         s, a, returns, discounts, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
@@ -387,10 +384,10 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # Both in one pass: normalized apart, what the replay did and what the actor would do could not be compared.
+            # One pass, as in CrossQ: the same statistics normalize the replay's and the actor's actions.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
-            self.critics.eval()
+            self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
             y = td_targets(returns, discounts, next_q, next_log_probs, alpha)  # (B,)
         loss_q = critic_loss(q, y, config.critic_loss_weight)  # w Σ mean (Q − y)²
@@ -452,7 +449,7 @@ def evaluate(policy, task, seed):
 
 
 class AppendPrivileged(gym.ObservationWrapper):
-    """Ends every observation (O,) with the environment's `privileged_observation()` (P,), which only critics see."""
+    """Appends `privileged_observation()` (P,), for the critics, to every observation (O,)."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -481,9 +478,9 @@ def make_training_env(task, privileged):
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
-    Raises InputError for a config that cannot be run, RunError when the run fails; what it saved stays. A resumed run
-    equals one that was never interrupted: a checkpoint holds the agent, the replay and the random generators, and of
-    the running episodes their seeds and actions, which bring the simulator back to the same state.
+    Raises InputError for an unusable config and RunError when the run fails. Saved files stay. A resumed run equals an
+    uninterrupted one: the checkpoint holds the agent, the replay, the random generators, and the seeds and actions of
+    the running episodes. The resumed run plays these again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:
@@ -499,10 +496,10 @@ def train(config):
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
         step, env_steps = run.start(agent, buffer, envs)
         for k in np.flatnonzero(envs.lost):
-            buffer.incomplete[k].clear()  # the steps that should complete these will not come
+            buffer.incomplete[k].clear()  # this episode could not be played again: a new one has begun
         if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)
-        run.evaluate(0, 0, policy=None)
+            run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
+        run.evaluate(0, 0, policy=None)  # random actions, for comparison
         while step < config.num_iterations:
             warming_up = env_steps < config.initial_collect_steps
             if step % config.eval_interval == 0 and not warming_up:
@@ -510,27 +507,27 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect, where the next update is due new experience. The physics runs beside that update.
+            # Collect until `due` environment steps are done. The physics runs in its worker during the update.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
             if collecting:
                 if warming_up:
                     actions = agent.random_actions(config.num_envs)
                 else:
-                    by_policy = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # every second episode
-                    actions = agent.act(envs.observations, sampled=~by_policy)
+                    deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # every second episode
+                    actions = agent.act(envs.observations, deterministic)
                 envs.step_async(actions)
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:
+            if env_steps >= due and not warming_up:  # the first evaluation and the scales come before
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
                 run.progress.update()
                 if step % config.log_interval == 0:
                     run.log_training(step, env_steps, envs, metrics)
             if collecting:
-                buffer.add(*envs.step_wait())
-            if warming_up and env_steps >= config.initial_collect_steps:
-                agent.fit_scaling(*buffer.observations_and_returns())
+                buffer.add(*envs.step_wait())  # the step that ran beside the update
+                if warming_up and env_steps >= config.initial_collect_steps:
+                    agent.fit_scaling(*buffer.observations_and_returns())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
@@ -738,9 +735,7 @@ class MinitaurBulletEnv(gym.Env):
 
     def _observation(self):
         self.position, self.orientation = self.simulator.getBasePositionAndOrientation(self.robot)
-        return np.concatenate(
-            (self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32, casting="same_kind"
-        )
+        return np.concatenate((self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32)
 
     def privileged_observation(self):
         """What the observation lacks, (7,) float32: the base's velocity in m/s and angular velocity in rad/s, both in

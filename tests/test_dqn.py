@@ -98,11 +98,6 @@ def test_advantage_learning_pushes_values_apart():
     assert agent.q_network(agent.scaling(torch.ones(4))).tolist() == pytest.approx([1, -1], abs=0.02)
 
 
-def test_loss_by_hand():
-    q, targets = torch.tensor([1.0, 5.0, 0.0]), torch.tensor([1.5, 2.0, 0.0])
-    assert dqn_cartpole.td_loss(q, targets).item() == pytest.approx((0.5**2 + 3**2 + 0) / 3)
-
-
 # The network
 
 

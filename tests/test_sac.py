@@ -371,7 +371,7 @@ def test_act_samples_or_takes_the_mean():
     agent.update(make_batch())  # so that the averaged actor is not the actor
     observations = torch.randn(4, 3)
     torch.manual_seed(7)
-    actions = torch.from_numpy(agent.act(observations.numpy(), sampled=np.array([True, False, False, True])))
+    actions = torch.from_numpy(agent.act(observations.numpy(), np.array([False, True, True, False])))
     torch.manual_seed(7)
     sampled, _ = agent.actor.sample(agent.scaling(observations))
     assert torch.equal(actions[::3], sampled[::3].detach())
@@ -384,11 +384,11 @@ def test_only_the_critics_see_the_end_of_a_longer_observation():
     agent.update(make_batch(observation_size=5))
     observations = torch.randn(4, 5)
     others = torch.cat((observations[:, :3], torch.randn(4, 2)), dim=1)
-    for sampled in (np.ones(4, bool), np.zeros(4, bool)):
+    for deterministic in (np.zeros(4, bool), np.ones(4, bool)):
         torch.manual_seed(7)
-        actions = agent.act(observations.numpy(), sampled)
+        actions = agent.act(observations.numpy(), deterministic)
         torch.manual_seed(7)
-        assert (agent.act(others.numpy(), sampled) == actions).all()
+        assert (agent.act(others.numpy(), deterministic) == actions).all()
     torch.testing.assert_close(agent.policy(observations[:, :3]), torch.from_numpy(actions))
     assert (agent.critics(observations, torch.zeros(4, 2)) != agent.critics(others, torch.zeros(4, 2))).all()
 
@@ -433,7 +433,7 @@ def test_the_tutorials_values_are_the_defaults():
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     lines = Path(sac_minitaur.__file__).read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
-    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours | {"replay_buffer_capacity"} and len(ours) == 11
+    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 12
     assert Config(tutorial=True) == Config(**TUTORIALS, tutorial=True)
     assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
 
@@ -683,9 +683,9 @@ def test_the_same_seed_gives_the_same_bits(tiny_run, tmp_path):
 def test_every_second_episode_is_collected_by_the_mean_action(mean_action_episodes, tmp_path, monkeypatch):
     act, flags = SACAgent.act, []
 
-    def recorded(self, observations, sampled):
-        flags.extend(sampled)
-        return act(self, observations, sampled)
+    def recorded(self, observations, deterministic):
+        flags.extend(~deterministic)
+        return act(self, observations, deterministic)
 
     monkeypatch.setattr(SACAgent, "act", recorded)
     choices = dict(initial_collect_steps=150, num_iterations=270, mean_action_episodes=mean_action_episodes)
