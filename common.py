@@ -755,11 +755,11 @@ def require_finite(module, step):
 
 def summarize(results):
     """The metrics of evaluation episodes, from a list of (return, length), and a line that tells them."""
-    (mean, length), (spread, spread_length) = np.mean(results, axis=0).tolist(), np.std(results, axis=0).tolist()
-    returns = [episode_return for episode_return, _ in results]
+    returns, lengths = zip(*results)
+    mean, spread, length, length_spread = (float(f(x)) for x in (returns, lengths) for f in (np.mean, np.std))
     row = {"average_return": mean, "std_return": spread, "min_return": min(returns), "max_return": max(returns)}
-    row |= {"average_episode_length": length, "std_episode_length": spread_length}
-    text = f"AverageReturn = {mean:.6f} +/- {spread:.6f}, AverageEpisodeLength = {length:.6f} +/- {spread_length:.6f}"
+    row |= {"average_episode_length": length, "std_episode_length": length_spread}
+    text = f"AverageReturn = {mean:.6f} +/- {spread:.6f}, AverageEpisodeLength = {length:.6f} +/- {length_spread:.6f}"
     return row, text
 
 

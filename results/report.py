@@ -111,6 +111,20 @@ def print_ablation(base, step, more):
         print(f"| {label} | {' | '.join(map(number, returns))} | {median(returns):.2f} |")
 
 
+def print_dqn_ablation(base):
+    """How many seeds of `base` and of the runs without a choice reach 200 early and stay there, from 10 000 updates on."""
+    print(f"\n### {base}, without one choice\n\n| without | seeds | 200 by 5000 | median first 200 | stay ≥ 195 | worst |")
+    print(f"|{' --- |' * 6}")
+    names = sorted(path.name for path in RESULTS.glob(f"{base}_without_*"))
+    for name in (base, *names, f"{base}_tutorial"):
+        curves = [returns_by_step(rows) for rows in runs(name).values()]
+        first = [next((s for s, value in at.items() if s > 0 and value >= 200), math.inf) for at in curves]
+        worst = [min(value for s, value in at.items() if s >= 10_000) for at in curves]
+        label = name.removeprefix(base).removeprefix("_without_").removeprefix("_") or "nothing"
+        early, stay = sum(s <= 5_000 for s in first), sum(value >= 195 for value in worst)
+        print(f"| {label} | {len(curves)} | {early} | {number(median(first), 0)} | {stay} | {min(worst):.1f} |")
+
+
 def draw(name, title, threshold, ours, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
@@ -136,14 +150,15 @@ def draw(name, title, threshold, ours, published):
 
 def main():
     for name in sorted({path.parts[-3] for path in RESULTS.glob("*/seed*/eval.csv")}):
-        if name.startswith("dqn"):
+        if name in ("dqn_cartpole", "dqn_cartpole_v1", "dqn_cartpole_130000"):
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
-        elif "_without_" not in name:
+        elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
     print_stretches("sac_minitaur_long", (100_000, 200_000, 400_000, 600_000, 800_000, 1_000_000))
     exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
     print_ablation("sac_minitaur", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
     print_ablation("sac_unprivileged", 30_000, {})
+    print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
 

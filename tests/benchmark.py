@@ -1,6 +1,6 @@
 """Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
 
-    python tests/benchmark.py                  # 12 minutes, 18 with both peers; nothing else should run on the machine
+    python tests/benchmark.py                  # 15 minutes, 30 with the peers; nothing else should run on the machine
     pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
 
 Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
@@ -76,7 +76,7 @@ def update_candidates():
 
     def new_agent(config):
         spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
-        return sac_minitaur.SACAgent(config, *spaces, cpu, common.Ranks(), state_size=35)
+        return sac_minitaur.SACAgent(config, *spaces, 35, cpu, common.Ranks())
 
     def update(agent, num_threads):
         torch.set_num_threads(num_threads)
@@ -92,14 +92,13 @@ def run(*command):
     """What a Python command prints, run in a process of its own."""
     command = [sys.executable, *map(str, command)]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "tests")}  # for the task registered above
-    return subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 def training(evaluations, *flags):
     """Milliseconds an iteration by the run's own clock, from `TRAINING_STEPS` updates to twice as many.
 
-    By then the evaluations before the first update are over. With `evaluations` there are 2 episodes for every 1 000
-    iterations, which is the default command's 20 for 10 000: all that start in this time end in it.
+    With `evaluations` there are 2 episodes for every 1 000 iterations, which is the default command's 20 for 10 000.
     """
     with tempfile.TemporaryDirectory() as directory:
         run(
@@ -113,33 +112,53 @@ def training(evaluations, *flags):
     return (end - start) / TRAINING_STEPS * 1e3
 
 
-def peer_training(module, evaluations):
-    """The same of `SAC` of stable_baselines3 or sbx, with the tutorials' sizes, in a process of its own."""
-    code = f"""
+def peer(code):
+    """Runs a peer's job in a process of its own. It prints milliseconds last."""
+    start = """
 import time, torch, gymnasium as gym
-from {module} import SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 torch.set_num_threads(2)
+start = time.perf_counter()
+"""
+    return float(run("-c", start + code).splitlines()[-1])
+
+
+def peer_training(module, algorithm, evaluations, settings=""):
+    """The same of an algorithm of stable_baselines3 or sbx, with the tutorials' sizes."""
+    return peer(f"""
+from {module} import {algorithm}
 env, eval_env = (gym.make("benchmark:{UPRIGHT}") for _ in range(2))
 callback = EvalCallback(Monitor(eval_env), n_eval_episodes=2, eval_freq=1000, verbose=0) if {evaluations} else None
-model = SAC("MlpPolicy", env, learning_starts=500, batch_size=256, buffer_size=100_000)
+model = {algorithm}("MlpPolicy", env, learning_starts=500, batch_size=256, buffer_size=100_000 {settings})
 model.learn(600)
 start = time.perf_counter()
 model.learn({TRAINING_STEPS}, reset_num_timesteps=False, callback=callback)
 print((time.perf_counter() - start) / {TRAINING_STEPS} * 1e3)
-"""
-    return float(run("-c", code).splitlines()[-1])
+""")
 
 
-def training_candidates(evaluations):
-    """Ours on one and two threads, ours with target critics, and the peers that are installed, which have these too."""
-    yield "ours, 1 thread", lambda: training(evaluations)
-    yield "ours, 1 thread, target critics", lambda: training(evaluations, "--no-critic-batch-norm")
+def installed(module):
+    return importlib.util.find_spec(module) is not None
+
+
+def crossq_candidates(evaluations):
+    """Critics with batch normalization and no targets, an actor update at every update, two layers of 256 each."""
+    yield "ours, 1 thread (default)", lambda: training(evaluations)
     yield "ours, 2 threads", lambda: training(evaluations, "--num-threads", 2)
+    settings = ", policy_delay=1, policy_kwargs={'net_arch': {'pi': [256, 256], 'qf': [256, 256]}}"
+    if installed("sbx"):
+        yield "SBX CrossQ", lambda: peer_training("sbx", "CrossQ", evaluations, settings)
+
+
+def sac_candidates(evaluations):
+    """Critics with target critics."""
+    plain = ("--no-critic-batch-norm",)
+    yield "ours, 1 thread", lambda: training(evaluations, *plain)
+    yield "ours, 2 threads", lambda: training(evaluations, *plain, "--num-threads", 2)
     for name, module in (("Stable-Baselines3", "stable_baselines3"), ("SBX", "sbx")):
-        if importlib.util.find_spec(module):
-            yield f"{name}, 2 threads", lambda module=module: peer_training(module, evaluations)
+        if installed(module):
+            yield name, lambda module=module: peer_training(module, "SAC", evaluations)
 
 
 def dqn(*flags):
@@ -148,9 +167,26 @@ def dqn(*flags):
         return milliseconds(lambda: run(*command), 1)
 
 
+def peer_dqn(module):
+    """The same job: the tutorial's network and sizes, an update at every step, 20 evaluations of 10 episodes."""
+    return peer(f"""
+from {module} import DQN
+callback = EvalCallback(Monitor(gym.make("CartPole-v0")), n_eval_episodes=10, eval_freq=1000, verbose=0)
+model = DQN("MlpPolicy", "CartPole-v0", learning_rate=1e-3, buffer_size=100_000, learning_starts=100, batch_size=64,
+            train_freq=1, gradient_steps=1, exploration_initial_eps=0.1, exploration_final_eps=0.1,
+            policy_kwargs={{"net_arch": [100, 50]}})
+model.learn(20_100, callback=callback)
+import sys; print("ends at", callback.last_mean_reward, file=sys.stderr)
+print((time.perf_counter() - start) * 1e3)
+""")
+
+
 def dqn_candidates():
     yield "20 000 updates", dqn
-    yield "1 update", lambda: dqn("--num-iterations", 1)  # so this much is start-up
+    yield "1 update", lambda: dqn("--num-iterations", 1)  # so this much is start-up and the files at the end
+    for name, module in (("Stable-Baselines3", "stable_baselines3"), ("SBX", "sbx")):
+        if installed(module):
+            yield name, lambda module=module: peer_dqn(module)
 
 
 def main():
@@ -159,8 +195,10 @@ def main():
     for title, candidates in (
         ("Minitaur, one step", environment_candidates()),
         ("SAC update, batch 256", update_candidates()),
-        ("SAC training, an iteration without evaluations", training_candidates(evaluations=False)),
-        ("SAC, an iteration of the whole job", training_candidates(evaluations=True)),
+        ("CrossQ's critics, an iteration without evaluations", crossq_candidates(evaluations=False)),
+        ("CrossQ's critics, an iteration of the whole job", crossq_candidates(evaluations=True)),
+        ("plain SAC, an iteration without evaluations", sac_candidates(evaluations=False)),
+        ("plain SAC, an iteration of the whole job", sac_candidates(evaluations=True)),
         ("DQN, the default command but for the videos", dqn_candidates()),
     ):
         result = medians(dict(candidates))
