@@ -114,7 +114,8 @@ def read_command_line(config_class, description, script):
     try:
         default = config_class(**saved.get("config", {}) | given)
     except ValueError as error:
-        raise InputError(f"{[*given.values()][0]} has a config that is no good: {' '.join(str(error).split())}") from None
+        what = " ".join(str(error).split())
+        raise InputError(f"{[*given.values()][0]} has a config that is no good: {what}") from None
     return tyro.cli(config_class, description=description, default=default)
 
 
@@ -467,7 +468,7 @@ class Run:
         # To the microsecond, for runs that are started at once.
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
         self.path = config.resume or config.run_dir or Path("runs") / name
-        # What the run has found so far; a snapshot is a caption and the policy's weights, for the film of how it learned.
+        # What the run has found; a snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
         self.tables = self.found["tables"]
@@ -682,7 +683,7 @@ class Run:
         return self._in_pool(film, policies, name, [arguments])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
-        """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for weights gone wrong."""
+        """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
         self.saved_step = step
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":

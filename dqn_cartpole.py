@@ -217,7 +217,7 @@ def action_gap(q, actions):
 
 
 class DQNAgent(nn.Module):
-    """The Q-network, its copy of one update ago for the targets, the optimizer, and the greedy policy that is evaluated."""
+    """The Q-network, its copy that gives the targets, the optimizer, and the greedy policy that is evaluated."""
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
