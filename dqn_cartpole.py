@@ -52,7 +52,7 @@ class Config:
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
-    target_update_tau: Fraction = 1.0  # fraction of the way that the target network moves an update
+    target_update_tau: Fraction = 0.05  # ours (theirs: 1): fraction of the way that the target network moves an update
     value_unit: bool = True  # ours (theirs: no): Q = (mean reward + mean |reward| × network's output) / (1 − γ)
     advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): weight of action_gap in a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
@@ -84,7 +84,8 @@ class Config:
 
 
 TUTORIAL = dict(
-    learning_rate_decay=None, gamma=1.0, value_unit=False, advantage_learning=0.0, observation_scaling=False
+    learning_rate_decay=None, gamma=1.0, target_update_tau=1.0, value_unit=False, advantage_learning=0.0,
+    observation_scaling=False,
 )  # fmt: skip
 
 
@@ -217,7 +218,7 @@ def action_gap(q, actions):
 
 
 class DQNAgent(nn.Module):
-    """The Q-network, its copy that gives the targets, the optimizer, and the greedy policy that is evaluated."""
+    """The Q-network, its slow copy for steady targets, the optimizer, and the greedy policy that is evaluated."""
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
@@ -287,7 +288,7 @@ class DQNAgent(nn.Module):
 
         with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄)
             for target, parameter in zip(self.target_network.parameters(), self.q_network.parameters()):
-                target.lerp_(parameter, config.target_update_tau)
+                target.lerp_(parameter, config.target_update_tau)  # ours: τ below 1
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
 
 
