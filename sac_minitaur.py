@@ -15,6 +15,7 @@ Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default i
 import copy
 import dataclasses
 import math
+import weakref
 from collections import deque
 from functools import partial
 from pathlib import Path
@@ -574,6 +575,7 @@ class Simulator:
 
         self.pybullet = pybullet
         self.client = pybullet.connect(pybullet.DIRECT)
+        weakref.finalize(self, pybullet.disconnect, self.client)
         self.setAdditionalSearchPath(pybullet_data.getDataPath())
 
     def __getattr__(self, name):
@@ -582,10 +584,6 @@ class Simulator:
             value = partial(value, physicsClientId=self.client)
         setattr(self, name, value)  # looked up once
         return value
-
-    def __del__(self):
-        if "client" in self.__dict__:  # not where pybullet is missing
-            self.disconnect()
 
 
 class MinitaurBulletEnv(gym.Env):

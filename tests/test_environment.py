@@ -418,6 +418,17 @@ print(env.spec.max_episode_steps, observation.tobytes().hex(), env.unwrapped.dyn
     assert [line for line in process.stderr.splitlines() if not line.startswith("pybullet build time")] == []
 
 
+def test_a_program_may_end_while_it_holds_the_environment(tmp_path):
+    """In a circle of references, as the models of other libraries hold it."""
+    code = f"""
+import gymnasium, types
+keep = types.SimpleNamespace(env=gymnasium.make("sac_minitaur:{ENV_ID}"))
+keep.itself = keep
+"""
+    process = run_python(code, tmp_path)
+    assert process.returncode == 0 and "Exception ignored" not in process.stderr
+
+
 def test_other_tasks_need_no_pybullet(tmp_path):
     code = f"""
 import sys
