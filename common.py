@@ -561,7 +561,8 @@ class Run:
         bar = self.writes and getattr(sys.stderr, "isatty", bool)()
         self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
         self.stack.callback(self.progress.close)
-        self.print(f"{config.env_id}, seed {config.seed}, episodes of at most {self.task.max_episode_steps} steps")
+        limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
+        self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         if environments.lost.any():

@@ -158,7 +158,7 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
     task = {"env_id": f"{__name__}:Endless-v0"}
     assert common.find_task(Config(**task), gym.spaces.Box)[0].max_episode_steps == 10_000
     path, _ = train(tmp_path / "run", **SHORT, **task, max_episode_steps=7)
-    assert "at most 7 steps an episode (--max-episode-steps)" in capsys.readouterr().out
+    assert "at most 7 steps (--max-episode-steps)" in capsys.readouterr().out
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
     assert common.find_task(Config(env_id="Pendulum-v1"), gym.spaces.Box)[0].max_episode_steps == 200
     assert (
