@@ -37,8 +37,8 @@ import torch
 import torch.distributed as dist
 import tyro
 from gymnasium.vector.utils import CloudpickleWrapper
-from pydantic import ConfigDict, Field, TypeAdapter
-from pydantic_core import ArgsKwargs
+from pydantic import ConfigDict, Field
+from pydantic_core import ArgsKwargs, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 2  # of checkpoints and policies
@@ -91,7 +91,11 @@ def first_line(error):
 # Configs and the command line
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Below1 = Annotated[float, Field(ge=0, lt=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
+Threads = Annotated[int, Field(ge=1, le=1024)]
 
 
 def with_tutorial_values(given, tutorial):
@@ -104,11 +108,13 @@ def read_command_line(config_class, description, script):
     """The config that the command line asks for. Its defaults are those of `config_class`, of the tutorial
     (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
     config = tyro.cli(config_class, description=description)
-    saved, given = {}, {"tutorial": config.tutorial}
+    saved, given = {}, {"tutorial": True}
     if config.resume is not None:
         saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
     elif config.evaluate is not None:
         saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
+    elif not config.tutorial:
+        return config  # its defaults are those already
     if saved and (others := vars(config).keys() ^ saved["config"].keys()):
         raise InputError(f"{[*given.values()][0]} is of another version of this script: it differs in {min(others)}")
     try:
@@ -121,8 +127,7 @@ def read_command_line(config_class, description, script):
 
 def plain_config(config):
     """The config as a dict of numbers, strings and lists, without the paths of this very run."""
-    values = TypeAdapter(type(config)).dump_python(config, mode="json")
-    return values | {"run_dir": None, "resume": None, "evaluate": None}
+    return to_jsonable_python(config) | {"run_dir": None, "resume": None, "evaluate": None}
 
 
 # Devices, memory and seeds
@@ -664,9 +669,9 @@ class Run:
         self.print(f"{f'step = {step}' if policy else 'random policy'}: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
-            # Five policies, closer to each other at the beginning, where most is learned.
             require_finite(policy, step)
             weights = policy.state_dict()
+            # Five policies, closer to each other at the beginning, where most is learned.
             if step >= (len(self.found["snapshots"]) / 4) ** 2 * self.config.num_iterations:
                 self.found["snapshots"].append((f"{step} updates: return {row['average_return']:.1f}", weights))
             if row["average_return"] > self.found["best"][0]:

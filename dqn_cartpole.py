@@ -17,12 +17,11 @@ import math
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, PositiveInt, model_validator
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -31,7 +30,6 @@ import common
 
 # gymnasium recommends v1, which has 500 steps. The tutorial uses v0, which has 200.
 warnings.filterwarnings("ignore", ".*environment CartPole-v0 is out of date", DeprecationWarning)
-Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(frozen=True, config=common.CONFIG)
@@ -50,18 +48,20 @@ class Config:
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
     learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): updates until the learning rate is half
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
-    epsilon: Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
-    gamma: Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
-    target_update_tau: Fraction = 0.05  # ours (theirs: 1): fraction of the way that the target network moves an update
+    epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
+    gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
+    target_update_tau: common.Fraction = (
+        0.05  # ours (theirs: 1): fraction of its way the target network moves an update
+    )
     value_unit: bool = True  # ours (theirs: no): Q = (mean reward + mean |reward| × network's output) / (1 − γ)
-    advantage_learning: Annotated[float, Field(ge=0, lt=1)] = 0.9  # ours (theirs: 0): weight of action_gap in a target
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): weight of action_gap in a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
     tutorial: bool = False  # set every value marked "ours" back to the tutorial's; other flags override it
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
+    seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; more gain nothing here
+    num_threads: common.Threads = 1  # CPU threads of the update; more gain nothing here
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training

@@ -19,19 +19,16 @@ import weakref
 from collections import deque
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, PositiveInt, model_validator
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
 
 import common
-
-Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(frozen=True, config=common.CONFIG)
@@ -51,15 +48,15 @@ class Config:
     critic_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
-    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
+    adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
-    target_update_tau: Fraction = 0.005  # fraction of the way that the target critics, if any, move an update
-    gamma: Fraction = 0.99  # discount
+    target_update_tau: common.Fraction = 0.005  # fraction of the way that the target critics, if any, move an update
+    gamma: common.Fraction = 0.99  # discount
     n_step: PositiveInt = 3  # ours (theirs: 1): rewards that a target sums before it uses the critics
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by the std of the random steps' n-step returns
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: Fraction = 0.005  # ours (theirs: 1): the same for the evaluated policy, towards the actor
+    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): the same for the evaluated policy and the actor
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours, as in the paper (theirs: −0.5): entropy that α aims at, per action
@@ -69,9 +66,9 @@ class Config:
     observation_scaling: bool = True  # ours (theirs: no): standardize by mean and spread of the initial random data
     tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0  # source of all randomness
+    seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1  # CPU threads of the update; the physics uses another core
+    num_threads: common.Threads = 1  # CPU threads of the update; the physics uses another core
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
