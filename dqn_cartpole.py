@@ -50,9 +50,7 @@ class Config:
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
-    target_update_tau: common.Fraction = (
-        0.05  # ours (theirs: 1): fraction of its way the target network moves an update
-    )
+    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): part of its way the target network moves an update
     value_unit: bool = True  # ours (theirs: no): Q = (mean reward + mean |reward| × network's output) / (1 − γ)
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): weight of action_gap in a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
