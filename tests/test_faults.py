@@ -399,7 +399,12 @@ def test_processes_that_cannot_train(script, tmp_path):  # noqa: F811
 
 def train_in_a_pool(module):
     config = module.Config(env_id="Pendulum-v1" if module.__name__ == "sac_minitaur" else "CartPole-v1")
-    module.main = lambda: multiprocessing.Pool(1).map(module.train, [config])
+
+    def main():
+        with multiprocessing.Pool(1) as pool:  # a pool that nobody ends may print a traceback of its own at exit
+            pool.map(module.train, [config])
+
+    module.main = main
 
 
 # Films
