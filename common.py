@@ -197,13 +197,13 @@ class Ranks:
             dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
         return cls(dist.get_rank(), dist.get_world_size())
 
-    def batch_share(self, config, held_back=0):
+    def batch_share(self, config):
         """The size of this process's share of a batch. Raises InputError when the shares are not equal, or when the
-        initial steps, less the last `held_back` of each process, do not fill the batch."""
+        initial steps do not fill the batch."""
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
-        own = min(config.initial_collect_steps // self.world_size - held_back, config.replay_buffer_capacity)
-        if config.batch_size > (stored := max(0, own * self.world_size)):
+        own = min(config.initial_collect_steps // self.world_size, config.replay_buffer_capacity)
+        if config.batch_size > (stored := own * self.world_size):
             raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
         return config.batch_size // self.world_size
 

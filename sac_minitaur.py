@@ -16,7 +16,6 @@ import copy
 import dataclasses
 import math
 import weakref
-from collections import deque
 from functools import partial
 from pathlib import Path
 
@@ -53,8 +52,7 @@ class Config:
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # fraction of the way that the target critics, if any, move an update
     gamma: common.Fraction = 0.99  # discount
-    n_step: PositiveInt = 3  # ours (theirs: 1): rewards that a target sums before it uses the critics
-    reward_scaling: bool = True  # ours (theirs: no): divide rewards by the std of the random steps' n-step returns
+    reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): the same for the evaluated policy and the actor
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
@@ -85,7 +83,7 @@ class Config:
 
 
 TUTORIAL = dict(
-    replay_buffer_capacity=10_000, adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, n_step=1,
+    replay_buffer_capacity=10_000, adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False,
     reward_scaling=False, reward_scale_factor=1.0, averaged_actor_tau=1.0, mean_action_episodes=False,
     target_entropy_per_action=-0.5, initial_log_alpha=0.0, observation_scaling=False,
 )  # fmt: skip
@@ -215,70 +213,57 @@ def require_finite(actions):
 
 
 class ReplayBuffer:
-    """The last `capacity` n-step transitions, on the training device, in float32, each one row of one tensor.
+    """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    A row holds an observation s₀, the action a₀ taken there, the return r₀ + γ r₁ + … of the n steps from there, the
-    last observation s' and the discount of its value: γⁿ, or 0 where the episode has ended. An episode cut off by its
-    time limit has not ended, and its last state has a value. Near the end of an episode n is the number of steps left.
-    Sampling is a single gather.
+    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. At a time limit
+    the episode could go on, so its last state has a value: only `terminated` marks an end.
     """
 
-    def __init__(self, capacity, state_size, action_size, n_step, gamma, num_envs, device):
+    def __init__(self, capacity, state_size, action_size, device):
         self.sizes = (state_size, action_size, 1, 1, state_size)
-        self.n_step, self.gamma = n_step, gamma
         self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
-        # Each environment's last steps (observation, action, reward), whose n-step returns are not complete.
-        self.incomplete = [deque() for _ in range(num_envs)]
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Takes one step of each of the K environments and stores every transition that is complete."""
-        for k, steps in enumerate(self.incomplete):
-            steps.append((observations[k], actions[k].ravel(), rewards[k]))
-            ended = terminated[k] or truncated[k]
-            while len(steps) == self.n_step or (ended and steps):
-                n_step_return = sum(self.gamma**i * reward for i, (_, _, reward) in enumerate(steps))
-                discount = 0.0 if terminated[k] else self.gamma ** len(steps)
-                observation, action, _ = steps.popleft()
-                row = np.concatenate((observation, action, (n_step_return, discount), next_observations[k]))
-                self.rows[self.position].copy_(torch.from_numpy(row))
-                self.position = (self.position + 1) % len(self.rows)
-                self.size = min(self.size + 1, len(self.rows))
+        """Stores K transitions, numpy arrays (K, S), (K, *action shape) and (K,). A full buffer overwrites its oldest."""
+        actions = actions.reshape(len(actions), -1)
+        columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
+        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
+        for row in rows:
+            self.rows[self.position].copy_(row)
+            self.position = (self.position + 1) % len(self.rows)
+            self.size = min(self.size + 1, len(self.rows))
 
     def sample(self, batch_size):
         """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
         indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
-        observations, actions, returns, discounts, next_observations = self.rows[indices].split(self.sizes, dim=1)
-        return observations, actions, returns.squeeze(1), discounts.squeeze(1), next_observations
+        observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
+        return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
 
-    def observations_and_returns(self):
+    def observations_and_rewards(self):
         """All that is stored of these: (size, S), (size,)."""
-        observations, _, returns, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
-        return observations, returns.squeeze(1)
+        observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return observations, rewards.squeeze(1)
 
     def state_dict(self):
-        """A copy of the filled part and of the incomplete transitions, for a checkpoint."""
-        incomplete = [[tuple(map(torch.as_tensor, step)) for step in steps] for steps in self.incomplete]
-        rows = self.rows[: self.size].to("cpu", copy=True)
-        return {"rows": rows, "position": self.position, "incomplete": incomplete}
+        """A copy of the filled part, for a checkpoint."""
+        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position}
 
     def load_state_dict(self, state):
         self.size, self.position = len(state["rows"]), state["position"]
         self.rows[: self.size] = state["rows"].to(self.rows.device)
-        for steps, saved in zip(self.incomplete, state["incomplete"]):
-            steps.extend(tuple(value.numpy() for value in step) for step in saved)
 
 
 # The agent
 
 
-def td_targets(returns, discounts, next_q, next_log_probs, alpha):
-    """R + discount × (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
+def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
+    """r + γ (1 − terminated) (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
-    next_q (2, B), alpha a scalar, the rest (B,). Equations 3 and 5 of arXiv:1812.05905 with the twins' minimum and n
-    rewards instead of one. Only the entropy at s' counts.
+    next_q (2, B), alpha and gamma scalars, the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins'
+    minimum.
     """
-    return returns + discounts * (next_q.amin(0) - alpha * next_log_probs)
+    return rewards + gamma * (1 - terminated) * (next_q.amin(0) - alpha * next_log_probs)
 
 
 def critic_loss(q, targets, weight):
@@ -337,15 +322,15 @@ class SACAgent(nn.Module):
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     @torch.no_grad()
-    def fit_scaling(self, observations, returns):
-        """Fixes the scales of observations and rewards by observations (N, S) and n-step returns (N,) of all ranks."""
+    def fit_scaling(self, observations, rewards):
+        """Fixes the scales of observations and rewards by observations (N, S) and rewards (N,) of all ranks."""
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
             for own, full in zip(self.policy.scaling.buffers(), self.scaling.buffers()):
                 own.copy_(full[: len(own)])  # the policy does not see what only the critics see
         if self.config.reward_scaling:
-            self.ranks.average([mean := returns.mean()])
-            self.ranks.average([variance := (returns - mean).square().mean()])
+            self.ranks.average([mean := rewards.mean()])
+            self.ranks.average([variance := (rewards - mean).square().mean()])
             std = variance.sqrt()
             self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
 
@@ -370,12 +355,12 @@ class SACAgent(nn.Module):
         here would make the CPU wait for the GPU.
         """
         config = self.config
-        s, a, returns, discounts, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
+        s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
         s, next_s = self.scaling(s), self.scaling(next_s)
-        returns = self.reward_scale * returns
+        rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
-        # The critics: Q(s, a) moves towards y = R + discount (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s').
+        # The critics: Q(s, a) moves towards y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s').
         with torch.no_grad():
             next_a, next_log_probs = self.actor.sample(next_s)  # (B, A), (B,)
         if self.target_critics:
@@ -387,7 +372,7 @@ class SACAgent(nn.Module):
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
-            y = td_targets(returns, discounts, next_q, next_log_probs, alpha)  # (B,)
+            y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
         loss_q = critic_loss(q, y, config.critic_loss_weight)  # w Σ mean (Q − y)²
         self._step(self.critic_optimizer, loss_q, self.critics.buffers())
 
@@ -482,19 +467,14 @@ def train(config):
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:
-        # An environment's last n - 1 steps are not in the buffer yet.
-        batch_size = run.ranks.batch_share(config, held_back=config.num_envs * (config.n_step - 1))
+        batch_size = run.ranks.batch_share(config)
         envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = SACAgent(config, observation_space, action_space, envs.observation_size, run.device, run.ranks)
-        buffer = ReplayBuffer(
-            config.replay_buffer_capacity, envs.observation_size, math.prod(action_space.shape), config.n_step,
-            config.gamma, config.num_envs, run.device,
-        )  # fmt: skip
+        sizes = envs.observation_size, math.prod(action_space.shape)
+        buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
         step, env_steps = run.start(agent, buffer, envs)
-        for k in np.flatnonzero(envs.lost):
-            buffer.incomplete[k].clear()  # this episode could not be played again: a new one has begun
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
@@ -525,7 +505,7 @@ def train(config):
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
                 if warming_up and env_steps >= config.initial_collect_steps:
-                    agent.fit_scaling(*buffer.observations_and_returns())
+                    agent.fit_scaling(*buffer.observations_and_rewards())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 

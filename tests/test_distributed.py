@@ -208,9 +208,7 @@ def test_batch_that_cannot_be_shared(tmp_path):
 
 
 def test_first_steps_that_are_too_few_for_two_processes(tmp_path):
-    # Of 260 steps each of two processes holds back the last two: 256 are left.
-    few = ("--num-envs", 1, "--n-step", 3, "--initial-collect-steps", 260, "--batch-size", 258)
-    few += ("--replay-buffer-capacity", 1000)
+    few = ("--num-envs", 1, "--initial-collect-steps", 256, "--batch-size", 258, "--replay-buffer-capacity", 1000)
     ranks = start_ranks(2, "sac_minitaur", flags("sac_minitaur", tmp_path / "run", *few), tmp_path / "output")
     end(ranks, [2, 2])
     assert ranks[0].stderr == "error: --batch-size 258 is more than the 256 transitions collected first\n"

@@ -26,7 +26,7 @@ from sac_minitaur import Actor, Config, ObservationScaling, Policy, ReplayBuffer
 ROOT = Path(__file__).parent.parent
 # The tutorials' values, here written down a second time.
 TUTORIALS = dict(
-    adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, n_step=1, reward_scaling=False,
+    adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False,
     reward_scale_factor=1, averaged_actor_tau=1, mean_action_episodes=False, target_entropy_per_action=-0.5,
     initial_log_alpha=0, observation_scaling=False, replay_buffer_capacity=10_000,
 )  # fmt: skip
@@ -46,9 +46,9 @@ def make_batch(size=32, observation_size=3, action_size=2):
     generator = torch.Generator().manual_seed(1)
     observations, next_observations = torch.randn(2, size, observation_size, generator=generator)
     actions = 2 * torch.rand(size, action_size, generator=generator) - 1
-    returns = torch.randn(size, generator=generator)
-    discounts = 0.97 * (torch.rand(size, generator=generator) > 0.3)
-    return observations, actions, returns, discounts, next_observations
+    rewards = torch.randn(size, generator=generator)
+    terminated = (torch.rand(size, generator=generator) < 0.3).float()
+    return observations, actions, rewards, terminated, next_observations
 
 
 # The losses
@@ -56,14 +56,15 @@ def make_batch(size=32, observation_size=3, action_size=2):
 
 def test_td_targets():
     targets = sac_minitaur.td_targets(
-        returns=torch.tensor([1.0, 1.0, -2.0]),
-        discounts=torch.tensor([0.9, 0.0, 0.81]),
+        rewards=torch.tensor([1.0, 1.0, -2.0]),
+        terminated=torch.tensor([0.0, 1.0, 0.0]),
         next_q=torch.tensor([[4.0, 4.0, 7.0], [3.0, 3.0, 9.0]]),
         next_log_probs=torch.tensor([-2.0, -2.0, 4.0]),
         alpha=torch.tensor(0.5),
+        gamma=0.9,
     )
-    # The second's episode has ended: 1 + 0.9 (3 + 0.5 · 2), 1, and two steps before its value −2 + 0.81 (7 − 0.5 · 4).
-    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.05]))
+    # The second's episode has ended: 1 + 0.9 (3 + 0.5 · 2), 1, −2 + 0.9 (7 − 0.5 · 4).
+    torch.testing.assert_close(targets, torch.tensor([4.6, 1.0, 2.5]))
 
 
 def test_critic_loss():
@@ -214,47 +215,35 @@ def filled(buffer, first, count):
     return buffer
 
 
-def test_n_step_transitions():
-    buffer = filled(ReplayBuffer(9, 2, 1, 3, 0.5, 1, CPU), 0, 8)
-    observations, actions, returns, discounts, last = buffer.rows[: buffer.size].split((2, 1, 1, 1, 2), dim=1)
-    n = torch.arange(7.0)[:, None]  # the eighth is not complete
-    torch.testing.assert_close(torch.cat((observations, actions), dim=1), torch.cat((n, n + 0.1, n + 0.2), dim=1))
-    # r₀ + r₁ / 2 + r₂ / 4, to the end of the episode and never beyond.
-    expected = [1 + 5 + 25, 10 + 50 + 250, 100 + 500, 1000, 1e4 + 5e4 + 25e4, 1e5 + 5e5, 1e6]
-    torch.testing.assert_close(returns[:, 0], torch.tensor(expected))
-    # Two episodes' ends: after a fall there is no value, at the time limit that of the state reached.
-    assert discounts[:, 0].tolist() == [0.125, 0, 0, 0, 0.125, 0.25, 0.5]
-    assert last[:, 1].tolist() == [2, 3, 3, 3, 6, 6, 6]
-
-    one_step = filled(ReplayBuffer(9, 2, 1, 1, 0.5, 1, CPU), 0, 8).rows[:8]
-    assert one_step[:, 3].tolist() == [10**n for n in range(8)]
-    assert one_step[:, 4].tolist() == [0.5, 0.5, 0.5, 0, 0.5, 0.5, 0.5, 0.5] and one_step[:, 6].tolist() == [*range(8)]
-
-
-def test_each_environment_has_n_step_transitions_of_its_own():
-    both, single = ReplayBuffer(99, 2, 1, 3, 0.5, 2, CPU), ReplayBuffer(99, 2, 1, 3, 0.5, 1, CPU)
-    for mine, other in zip(numbered(0, 7), numbered(1, 7)):
-        both.add(*(np.concatenate(pair) for pair in zip(mine, other)))
-        single.add(*other)
-    rows = both.rows[: both.size]
-    assert len(rows) == 7 + single.size
-    assert [row.tolist() for row in single.rows[: single.size] if not (rows == row).all(1).any()] == []
+def test_replay_buffer_keeps_what_each_environment_did():
+    buffer = ReplayBuffer(99, 2, 1, CPU)
+    for steps in zip(numbered(0, 8), numbered(10, 8)):  # of two environments
+        buffer.add(*(np.concatenate(pair) for pair in zip(*steps)))
+    observations, actions, rewards, terminated, next_observations = buffer.rows[:16].split((2, 1, 1, 1, 2), dim=1)
+    n = torch.arange(8.0).repeat_interleave(2)[:, None] + torch.tensor([0.0, 10.0]).repeat(8)[:, None]
+    torch.testing.assert_close(observations, torch.cat((n, n + 0.1), dim=1))
+    torch.testing.assert_close(actions, n + 0.2)
+    torch.testing.assert_close(rewards, 10**n)
+    torch.testing.assert_close(next_observations, torch.cat((n + 0.4, n), dim=1))
+    # A fall is an end, a time limit is none.
+    assert torch.equal(terminated, (n == 3).float())
+    assert (buffer.size, buffer.position) == (16, 16)
 
 
 def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     torch.manual_seed(0)
-    buffer = ReplayBuffer(5, 2, 1, 1, 0.5, 1, CPU)
+    buffer = ReplayBuffer(5, 2, 1, CPU)
     buffer.rows.fill_(torch.nan)
     filled(buffer, 0, 3)
-    observations, actions, returns, discounts, next_observations = buffer.sample(200)
+    observations, actions, rewards, terminated, next_observations = buffer.sample(200)
     n = observations[:, 0]
     assert set(n.tolist()) == {0, 1, 2}
     assert observations.shape == next_observations.shape == (200, 2) and actions.shape == (200, 1)
-    assert returns.shape == (200,)
+    assert rewards.shape == (200,)
     torch.testing.assert_close(observations[:, 1], n + 0.1)
     torch.testing.assert_close(actions[:, 0], n + 0.2)
-    torch.testing.assert_close(returns, 10**n)
-    assert torch.equal(discounts, torch.full((200,), 0.5))
+    torch.testing.assert_close(rewards, 10**n)
+    assert torch.equal(terminated, torch.zeros(200))
     torch.testing.assert_close(next_observations, torch.stack((n + 0.4, n), 1))
 
     filled(buffer, 3, 4)  # across the end
@@ -262,22 +251,22 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     counts = buffer.sample(5000)[0][:, 0].long().bincount()
     assert counts[:2].tolist() == [0, 0] and counts[2:].min() > 850 and len(counts) == 7
     pairs = zip(*(column.tolist() for column in buffer.sample(200)[2:4]))
-    assert set(pairs) == {(100, 0.5), (1000, 0), (1e4, 0.5), (1e5, 0.5), (1e6, 0.5)}
-    observations, returns = buffer.observations_and_returns()
-    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and returns.shape == (5,)
+    assert set(pairs) == {(100, 0), (1000, 1), (1e4, 0), (1e5, 0), (1e6, 0)}
+    observations, rewards = buffer.observations_and_rewards()
+    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and rewards.shape == (5,)
 
 
-@pytest.mark.parametrize("stored, position", [(3, 2), (8, 0)])
+@pytest.mark.parametrize("stored, position", [(3, 2), (8, 2)])
 def test_replay_buffer_goes_on_from_its_state(stored, position):
-    buffer = filled(ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU), 0, stored)
-    other = ReplayBuffer(5, 2, 1, 3, 0.5, 1, CPU)
+    buffer = filled(ReplayBuffer(5, 2, 1, CPU), 0, stored)
+    other = ReplayBuffer(5, 2, 1, CPU)
     state = buffer.state_dict()
     other.load_state_dict(state)
     for each in (buffer, other):
         filled(each, stored, 4)
     assert torch.equal(other.rows, buffer.rows) and buffer.size == other.size == 5
     assert other.position == buffer.position == position
-    assert len(state["rows"]) == min(stored - 2, 5)  # a copy: what was added later is not in it
+    assert len(state["rows"]) == min(stored, 5)  # a copy: what was added later is not in it
     assert state["rows"][:, 0].max() < stored
 
 
@@ -292,7 +281,7 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     config, batch = agent.config, make_batch()
     agent.fit_scaling(5 * batch[0] + 1, 3 * batch[2])
     observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
-    actions, returns, discounts = batch[1], agent.reward_scale * batch[2], batch[3]
+    actions, rewards, terminated = batch[1], agent.reward_scale * batch[2], batch[3]
     alpha = agent.log_alpha.exp().item()
     with torch.no_grad():
         followers = (agent.policy.actor,) if batch_norm else (agent.policy.actor, agent.target_critics)
@@ -318,7 +307,7 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
         critics.eval()
     else:
         q, next_q = critics(observations, actions), target_critics(next_observations, next_actions).detach()
-    targets = returns + discounts * (next_q.min(0).values - alpha * next_log_probs)
+    targets = rewards + 0.99 * (1 - terminated) * (next_q.min(0).values - alpha * next_log_probs)
     loss = 0.5 * ((q[0] - targets) ** 2).mean() + 0.5 * ((q[1] - targets) ** 2).mean()
     critic_gradients = torch.autograd.grad(loss, list(critics.parameters()))
     adam_step(critics.parameters(), critic_gradients, config.critic_learning_rate)
@@ -356,10 +345,10 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
 def test_update_learns_from_terminated_and_truncated_differently():
     batch = make_batch()
     losses = []
-    for discounts in (torch.ones(32), torch.zeros(32)):
+    for terminated in (torch.zeros(32), torch.ones(32)):
         torch.manual_seed(0)
         agent = make_agent(**TUTORIALS)
-        losses.append(agent.update((*batch[:3], discounts, batch[4]))["critic_loss"].item())
+        losses.append(agent.update((*batch[:3], terminated, batch[4]))["critic_loss"].item())
     q = make_agent(**TUTORIALS).critics(*batch[:2])
     assert losses[1] == pytest.approx(0.5 * (q - batch[2]).square().mean(1).sum().item(), rel=1e-5)
     assert abs(losses[0] - losses[1]) > 0.01
@@ -433,17 +422,17 @@ def test_the_tutorials_values_are_the_defaults():
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     lines = Path(sac_minitaur.__file__).read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
-    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 12
+    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 11
     assert Config(tutorial=True) == Config(**TUTORIALS, tutorial=True)
     assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
 
 
 def test_flags_beside_tutorial_still_count(monkeypatch):
-    monkeypatch.setattr(sys, "argv", "sac_minitaur.py --tutorial --n-step 3 --reward-scaling".split())
+    monkeypatch.setattr(sys, "argv", "sac_minitaur.py --tutorial --adam-beta1 0.7 --reward-scaling".split())
     config = common.read_command_line(Config, "", "sac_minitaur")
-    assert config == Config(**TUTORIALS | {"n_step": 3, "reward_scaling": True}, tutorial=True)
-    assert Config("Pendulum-v1", tutorial=True, n_step=3) == Config(
-        "Pendulum-v1", **TUTORIALS | {"n_step": 3}, tutorial=True
+    assert config == Config(**TUTORIALS | {"adam_beta1": 0.7, "reward_scaling": True}, tutorial=True)
+    assert Config("Pendulum-v1", tutorial=True, adam_beta1=0.7) == Config(
+        "Pendulum-v1", **TUTORIALS | {"adam_beta1": 0.7}, tutorial=True
     )
 
 
@@ -463,9 +452,9 @@ def test_an_update_reads_and_creates_nothing_on_another_device(monkeypatch, choi
     adam = torch.optim.Adam
     monkeypatch.setattr(torch.optim, "Adam", lambda *args, **kwargs: adam(*args, **kwargs | {"fused": False}))
     agent = make_agent(device="meta", state_size=5, **choices)
-    buffer = ReplayBuffer(40, 5, 2, 3, 0.99, 1, agent.device)
+    buffer = ReplayBuffer(40, 5, 2, agent.device)
     buffer.size = 40
-    agent.fit_scaling(*buffer.observations_and_returns())
+    agent.fit_scaling(*buffer.observations_and_rewards())
     metrics = agent.update(buffer.sample(32))
     assert {value.device for value in metrics.values()} == {agent.device}
 
@@ -591,11 +580,11 @@ def tiny_run(tmp_path_factory):
 def test_train_does_what_the_config_says(tiny_run):
     path, calls = tiny_run
     assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"]
-    observations, returns = calls[0][1]
-    assert observations.shape == (248, 3) and returns.shape == (248,)  # of 3 steps: the last two are not complete
+    observations, rewards = calls[0][1]
+    assert observations.shape == (250, 3) and rewards.shape == (250,)
     assert all(batch[0].shape == (32, 3) for _, (batch,) in calls[1:])
     shared, own = read_checkpoint(path)
-    assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) + 2 == 250 + 60
+    assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) == 250 + 60
     assert json.loads((path / "config.json").read_text())["num_iterations"] == 60
     files = {"config.json", "train.csv", "eval.csv", "random.csv", "learning_curve.png", "checkpoint.pt"}
     assert files | {"policy.pt", "policy.pt2", "best_policy.pt", "best_policy.pt2"} <= {
@@ -624,7 +613,7 @@ def test_train_writes_its_rows(tiny_run):
 
 def test_of_collected_episodes_the_last_ten_are_reported(tmp_path):
     choices = dict(env_id=f"{__name__}:Truncated-v0", initial_collect_steps=40, num_iterations=20, log_interval=20)
-    path, _ = train(tmp_path / "run", **choices, n_step=1)
+    path, _ = train(tmp_path / "run", **choices)
     assert read_checkpoint(path)[1]["environments"]["finished"] == 10 * [(1.0 + 2 + 3 + 4, 4)]  # of fifteen
     row = read_csv(path / "train.csv")[0]
     assert (row["collect_return"], row["collect_episode_length"]) == (10, 4)
@@ -696,10 +685,10 @@ def test_every_second_episode_is_collected_by_the_mean_action(mean_action_episod
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
     path, calls = train(tmp_path / "run", num_envs=3)
     # 250 is no multiple of 3. The scaling is fitted before the first update all the same, on all there is.
-    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252 - 3 * 2
+    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252
     assert all(row["env_steps"] - 250 - row["step"] in range(6) for row in read_csv(path / "train.csv"))
     shared, own = read_checkpoint(path)
-    assert shared["env_steps"] == len(own["buffer"]["rows"]) + 3 * 2 == 312
+    assert shared["env_steps"] == len(own["buffer"]["rows"]) == 312
     starts = own["buffer"]["rows"][:3, :3]
     assert len(starts.unique(dim=0)) == 3  # each environment has episodes of its own
 
@@ -713,18 +702,16 @@ def test_several_steps_per_update_and_a_small_buffer(tmp_path):
 
 @pytest.mark.parametrize("env_id, num_envs", [("Truncated-v0", 2), ("Terminated-v0", 1)])
 def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
-    choices = {"num_envs": num_envs, "initial_collect_steps": 40, "n_step": 1}
+    choices = {"num_envs": num_envs, "initial_collect_steps": 40}
     path, _ = train(tmp_path / "run", env_id=f"{__name__}:{env_id}", **choices)
     rows = read_checkpoint(path)[1]["buffer"]["rows"]
-    observations, actions, rewards, discounts, next_observations = rows.split((2, 1, 1, 1, 2), dim=1)
+    observations, actions, rewards, terminated, next_observations = rows.split((2, 1, 1, 1, 2), dim=1)
     # Within an episode to its very end, never the first observation of the next.
     assert torch.equal(next_observations, observations + torch.tensor([0.0, 1.0]))
     assert observations[:, 1].unique().tolist() == [0, 1, 2, 3]
     assert torch.equal(rewards, next_observations[:, 1:])  # unscaled, as the environment gave them
     ended = next_observations[:, 1:] == 4
-    torch.testing.assert_close(
-        discounts, 0.99 * ~ended if env_id == "Terminated-v0" else torch.full_like(discounts, 0.99)
-    )
+    assert torch.equal(terminated, (ended & (env_id == "Terminated-v0")).float())
     assert actions.abs().max() <= 1 and len(actions[:40].unique()) == 40
     # Every environment's episodes follow each other.
     for i in range(num_envs):
@@ -734,7 +721,7 @@ def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
 
 @pytest.mark.parametrize("privileged", [True, False])
 def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path, privileged):
-    choices = {"n_step": 1, "initial_collect_steps": 40, "privileged_critics": privileged}
+    choices = {"initial_collect_steps": 40, "privileged_critics": privileged}
     path, _ = train(tmp_path / "run", env_id=f"{__name__}:Telling-v0", **choices)
     shared, own = read_checkpoint(path)
     size = 3 if privileged else 2
@@ -857,7 +844,7 @@ def assert_one_line(status, stderr):
 
 OUT_OF_RANGE = """--batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
     --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
-    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --n-step 0, --device tpu,
+    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --device tpu,
     --actor-learning-rate -1, --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01,
     --target-update-tau -0.1, --averaged-actor-tau 7, --reward-scale-factor inf, --initial-log-alpha nan, --seed -1,
     --seed 9223372036854775808, --batch-size x, --wings 2""".split(",")
