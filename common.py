@@ -215,6 +215,12 @@ class Ranks:
             for tensor, mean in zip(tensors, means):
                 tensor.copy_(mean.view_as(tensor))
 
+    def mean_and_std(self, values):
+        """Mean and standard deviation of values (N, …) of all ranks, over the first dimension."""
+        self.average([mean := values.mean(0)])
+        self.average([variance := (values - mean).square().mean(0)])
+        return mean, variance.sqrt()
+
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
         if self.world_size == 1:

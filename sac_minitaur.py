@@ -7,6 +7,10 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
+The actor draws actions at random; two critics estimate their value Q. The actor learns to make Q + α × entropy large:
+it earns much, yet stays as random as it can, and so it explores. α is tuned until the entropy has a given value. The
+actor uses the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its errors.
+
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
 `Config`. README gives the reasons.
@@ -40,7 +44,7 @@ class Config:
     initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
-    replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 10 000, in 2018 this): transitions kept
+    replay_buffer_capacity: PositiveInt = 1_000_000  # ours, and 2018's (later: 10 000): transitions kept
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
     actor_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the actor
@@ -50,14 +54,14 @@ class Config:
     adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
-    target_update_tau: common.Fraction = 0.005  # fraction of the way that the target critics, if any, move an update
+    target_update_tau: common.Fraction = 0.005  # part of their way that the target critics, if any, move an update
     gamma: common.Fraction = 0.99  # discount
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): the same for the evaluated policy and the actor
+    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): part of its way to the actor that the policy moves
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours, as in the paper (theirs: −0.5): entropy that α aims at, per action
+    target_entropy_per_action: float = -1.0  # ours, the paper's (theirs: −0.5): α's aim, times an action's size
     initial_log_alpha: float = -2.0  # ours (theirs: 0): log α at the start; α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
@@ -89,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The networks (shapes: B batch, K environments, N stored, O observed, S seen by the critics, A per action)
+# The networks (shapes: B batch, K environments, N stored, O numbers observed, S seen by the critics, A in an action)
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -121,11 +125,10 @@ class ObservationScaling(nn.Module):
 
     def fit(self, observations, ranks):
         """Takes mean and standard deviation from observations (N, S) of all ranks."""
-        ranks.average([mean := observations.mean(0)])
-        ranks.average([variance := (observations - mean).square().mean(0)])
+        mean, std = ranks.mean_and_std(observations)
         self.mean.copy_(mean)
         # A number that is still under random actions may move later: its deviation counts as 0.01 or more.
-        self.std.copy_(variance.sqrt().clamp(min=0.01))
+        self.std.copy_(std.clamp(min=0.01))
         self.limit.fill_(10.0)
 
     def forward(self, observation):
@@ -162,10 +165,10 @@ class Actor(nn.Module):
 class TwinCritics(nn.Module):
     """Two separate estimates of Q(s, a) from the same data."""
 
-    def __init__(self, observation_size, action_size, hidden_layers, batch_norm):
+    def __init__(self, state_size, action_size, hidden_layers, batch_norm):
         super().__init__()
-        self.q1 = mlp(observation_size + action_size, hidden_layers, 1, batch_norm)
-        self.q2 = mlp(observation_size + action_size, hidden_layers, 1, batch_norm)
+        self.q1 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
+        self.q2 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
 
     def forward(self, observation, action):
         """(2, …) for scaled observations (…, S) and actions (…, A)."""
@@ -192,7 +195,7 @@ class Policy(nn.Module):
 
     @torch.inference_mode()
     def act(self, observation):
-        """The action for one raw observation, from numpy to numpy, in the action space's own type."""
+        """The action for one raw observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
         action = self(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
         require_finite(action)
         return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
@@ -225,7 +228,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Stores K transitions, numpy arrays (K, S), (K, *action shape) and (K,). A full buffer overwrites its oldest."""
+        """Stores K transitions: arrays (K, S), (K, *action shape) and (K,). A full buffer overwrites its oldest."""
         actions = actions.reshape(len(actions), -1)
         columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
@@ -289,6 +292,7 @@ class SACAgent(nn.Module):
 
     The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: these O and the
     privileged ones. The policy's actor is a running average of the actor, because a single snapshot may be bad.
+    `ranks` are the processes of torchrun. Where there is one, its `average` does nothing.
     """
 
     def __init__(self, config, observation_space, action_space, state_size, device, ranks):
@@ -323,15 +327,13 @@ class SACAgent(nn.Module):
 
     @torch.no_grad()
     def fit_scaling(self, observations, rewards):
-        """Fixes the scales of observations and rewards by observations (N, S) and rewards (N,) of all ranks."""
+        """Sets the scales of observations and rewards from observations (N, S) and rewards (N,) of all ranks."""
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
             for own, full in zip(self.policy.scaling.buffers(), self.scaling.buffers()):
                 own.copy_(full[: len(own)])  # the policy does not see what only the critics see
         if self.config.reward_scaling:
-            self.ranks.average([mean := rewards.mean()])
-            self.ranks.average([variance := (rewards - mean).square().mean()])
-            std = variance.sqrt()
+            _, std = self.ranks.mean_and_std(rewards)
             self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
@@ -367,7 +369,8 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # One pass, as in CrossQ: the same statistics normalize the replay's and the actor's actions.
+            # One pass, as in CrossQ: the same statistics normalize the replay's and the actor's actions. No gradient
+            # reaches next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
@@ -492,11 +495,11 @@ def train(config):
                 if warming_up:
                     actions = agent.random_actions(config.num_envs)
                 else:
-                    deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # every second episode
+                    deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
                     actions = agent.act(envs.observations, deterministic)
                 envs.step_async(actions)
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:  # the first evaluation and the scales come before
+            if env_steps >= due and not warming_up:  # not in the last warm-up step: first fit_scaling, then evaluate
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
                 run.progress.update()
@@ -541,8 +544,7 @@ class Dynamics:
 class Simulator:
     """A simulation of its own in this process, with pybullet's functions as methods.
 
-    It ends with its last reference. As `pybullet_utils.bullet_client.BulletClient`, which prints a line to the console
-    for every simulation it opens.
+    It ends when nothing refers to it any more. pybullet's own `BulletClient` prints a line for every simulation.
     """
 
     def __init__(self):
@@ -566,8 +568,8 @@ class Simulator:
 class MinitaurBulletEnv(gym.Env):
     """Ghost Robotics' Minitaur on a plane, equal to the last bit to pybullet's `MinitaurBulletEnv-v0` of the old gym.
 
-    Action (8,): for each leg (front left, back left, front right, back right) first its swing, then for each leg its
-    extension, in [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
+    Action (8,): the swings of the legs front left, back left, front right, back right, then their extensions, in
+    [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
     orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
     Reward: metres forward in this step less 0.005 × 0.002 s × the mechanical power in W.
@@ -578,7 +580,7 @@ class MinitaurBulletEnv(gym.Env):
 
     SUBSTEPS, SUBSTEP_SECONDS, SOLVER_ITERATIONS = 5, 0.002, 60
     MOTORS = tuple(f"{leg}{side}" for leg in ("front_left", "back_left", "front_right", "back_right") for side in "LR")
-    DIRECTION = np.array([-1.0, -1, -1, -1, 1, 1, 1, 1])
+    DIRECTION = np.array([-1.0, -1, -1, -1, 1, 1, 1, 1])  # the motors of the left legs turn the other way
     BASE_LINK = -1
     LEG_LINKS = (2, 3, 5, 6, 8, 9, 11, 12, 15, 16, 18, 19, 21, 22, 24, 25)
     MOTOR_LINKS = (1, 4, 7, 10, 14, 17, 20, 23)
@@ -611,7 +613,7 @@ class MinitaurBulletEnv(gym.Env):
         self.motor_enabled = np.ones(8, bool)
         self.x = 0.0
         self._read_motors()
-        for _ in range(100):
+        for _ in range(100):  # stands for 0.2 s in the start pose
             self._substep(math.pi / 2)
         return self._observation(), {}
 
@@ -658,7 +660,7 @@ class MinitaurBulletEnv(gym.Env):
 
     def step(self, action):
         """Raises ValueError when an action component is outside ±1.01, as the original does."""
-        action = 1.0 * np.asarray(action)  # whole numbers would be computed in whole numbers
+        action = 1.0 * np.asarray(action)  # integers become floats, float32 stays float32
         if not (np.abs(action) <= 1.01).all():
             raise ValueError(f"action {action} is outside [-1, 1]")
         command = self._motor_angles(action)
@@ -688,6 +690,7 @@ class MinitaurBulletEnv(gym.Env):
         simulator, dynamics = self.simulator, self.dynamics
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
         drive = pwm * dynamics.voltage
+        # The robot observes a torque without back-EMF and saturation. The torque that moves it, below, has both.
         self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(
             -self.MAX_OBSERVED_TORQUE, self.MAX_OBSERVED_TORQUE
         )
@@ -720,16 +723,15 @@ class MinitaurBulletEnv(gym.Env):
         return np.concatenate((velocity @ rotation, angular_velocity @ rotation, self.position[2:]), dtype=np.float32)
 
     def render(self):
-        """The robot from the side that it runs past, (360, 480, 3) uint8, from pybullet's software renderer."""
+        """The robot from its side, (360, 480, 3) uint8, from pybullet's software renderer."""
         simulator = self.simulator
-        position, _ = simulator.getBasePositionAndOrientation(self.robot)
-        view = simulator.computeViewMatrixFromYawPitchRoll(position, 1, yaw=0, pitch=-30, roll=0, upAxisIndex=2)
+        view = simulator.computeViewMatrixFromYawPitchRoll(self.position, 1, yaw=0, pitch=-30, roll=0, upAxisIndex=2)
         projection = simulator.computeProjectionMatrixFOV(fov=60, aspect=480 / 360, nearVal=0.1, farVal=100)
         pixels = simulator.getCameraImage(480, 360, view, projection, renderer=simulator.ER_TINY_RENDERER)[2]
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # ended just once: pybullet gives its number to the next one
+        self.simulator = None  # disconnects once: a newer simulation may get the same number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
