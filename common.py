@@ -41,7 +41,7 @@ from pydantic import ConfigDict, Field
 from pydantic_core import ArgsKwargs, to_jsonable_python
 from tqdm import tqdm
 
-FILE_FORMAT = 2  # of checkpoints and policies
+FILE_FORMAT = 3  # of checkpoints and policies
 # In an evaluation episode's seed this stands where training has the number of an environment.
 EVALUATION_KEY = 2**32 - 1
 # Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
@@ -215,12 +215,6 @@ class Ranks:
             for tensor, mean in zip(tensors, means):
                 tensor.copy_(mean.view_as(tensor))
 
-    def mean_and_std(self, values):
-        """Mean and standard deviation of values (N, …) of all ranks, over the first dimension."""
-        self.average([mean := values.mean(0)])
-        self.average([variance := (values - mean).square().mean(0)])
-        return mean, variance.sqrt()
-
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
         if self.world_size == 1:
@@ -252,15 +246,15 @@ def find_task(config, action_space):
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     if not isinstance(observations, gym.spaces.Box) or not observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
+    fits = isinstance(actions, action_space)
     if action_space is gym.spaces.Discrete:
-        fits = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
+        needed, fits = "Discrete from 0", fits and actions.start == 0
     else:
-        fits = isinstance(actions, gym.spaces.Box) and actions.shape and actions.dtype.kind == "f"
-        with np.errstate(all="ignore"):
-            widths = np.subtract(actions.high, actions.low, dtype=np.float32) if fits else np.zeros(1)
-        fits = (np.isfinite(widths) & (widths > 0)).all()
+        needed, fits = "Box of real numbers with finite bounds", fits and actions.shape and actions.dtype.kind == "f"
+        if fits:  # in float32, as the agent computes
+            widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
+            fits = (widths.isfinite() & (widths > 0)).all()
     if not fits:
-        needed = "Discrete from 0" if action_space is gym.spaces.Discrete else "Box of real numbers with finite bounds"
         raise InputError(f"{name} has the action space {actions}: a {needed} is needed")
     return task, observations, actions
 
@@ -276,8 +270,12 @@ def telling_task_errors():
         raise TaskError(f"the task failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
-def start_worker():
-    """In a worker process: leaves to the main process the signals that a whole group is sent, and ends with it."""
+def start_worker(task=None):
+    """In a worker process: leaves to the main process the signals that a whole group is sent, and ends with it.
+
+    `task` is what an evaluation's worker plays.
+    """
+    start_worker.task = task
     torch.set_num_threads(1)
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -292,12 +290,9 @@ class SeededEpisodes(gym.Wrapper):
     has returned.
     """
 
-    def __init__(self, env, key, episode=0, actions=(), total=0.0):
+    def __init__(self, env, key, episode, actions):
         super().__init__(env)
-        self.key, self.episode, self.actions, self.total = key, episode, list(actions), total
-
-    def state(self):
-        return self.episode, self.actions, self.total
+        self.key, self.episode, self.actions = key, episode, list(actions)
 
     def reset(self, **_):
         replay, self.actions, self.total = self.actions, [], 0.0
@@ -330,28 +325,25 @@ class Environments:
     def __init__(self, make_env, run, in_workers):
         """With `in_workers` each has a process of its own, so that `step_async` returns at once."""
         seed, num_envs, rank, main = run.config.seed, run.config.num_envs, run.ranks.rank, os.getpid()
-        saved = {"episodes": [(0, [], 0.0)] * num_envs, "finished": []}
+        saved = {"episodes": [(0, [])] * num_envs, "finished": []}
         if run.checkpoint:
             saved = run.checkpoint["ranks"][rank]["environments"]
-        self.in_workers, self.num_episodes = in_workers, np.array([number for number, *_ in saved["episodes"]])
+        self.in_workers, self.num_episodes = in_workers, np.array([number for number, _ in saved["episodes"]])
         self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
 
-        def make(i, episode, actions, total):
+        def make(i, episode, actions):
             if os.getpid() != main:
                 start_worker()
             with telling_task_errors():
-                return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions), total)
+                return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
 
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self.close)
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
-
-    def reset(self):
-        """Brings each to where its episode stands. `lost` (K,) tells where that had to be a new episode."""
-        self.observations, infos = self.vector.reset()
-        self.lost = infos.get("_not_repeatable", np.zeros(len(self.num_episodes), bool))
+        self.observations, infos = self.vector.reset()  # brings each to where its episode stands
+        self.lost = infos.get("_not_repeatable", np.zeros(num_envs, bool))  # where that had to be a new episode
         self.num_episodes += self.lost
 
     def step_async(self, actions):
@@ -378,8 +370,8 @@ class Environments:
         return {"collect_return": float(np.mean(returns)), "collect_episode_length": float(np.mean(lengths))}
 
     def state_dict(self):
-        episodes = [(n, torch.from_numpy(np.array(actions)), total) for n, actions, total in self.vector.call("state")]
-        return {"episodes": episodes, "finished": list(self.finished)}
+        actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
+        return {"episodes": list(zip(self.num_episodes.tolist(), actions)), "finished": list(self.finished)}
 
     def close(self):
         for process in getattr(self.vector, "processes", []):
@@ -419,14 +411,13 @@ def read_file(path, kind, script):
             if damaged := archive.testzip():  # torch.load does not look at the checksums
                 raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
-        found = state["kind"], state["script"], state["format"]
+        found = "a {kind} of {script}, format {format}".format_map(state)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: --resume takes a run's directory, --evaluate its policy.pt") from None
     except Exception as error:  # whatever a damaged or hostile file provokes
         raise InputError(f"{path} is not a whole {kind} of this project ({first_line(error)})") from None
-    if found != (kind, script, FILE_FORMAT):
-        found = f"a {found[0]} of {found[1]}, format {found[2]}"
-        raise InputError(f"{path} is {found}; needed: a {kind} of {script}, format {FILE_FORMAT}")
+    if found != (needed := f"a {kind} of {script}, format {FILE_FORMAT}"):
+        raise InputError(f"{path} is {found}; needed: {needed}")
     return state
 
 
@@ -441,18 +432,9 @@ def export_policy(path, policy, observation_shape):
 # Runs
 
 
-_task = None  # a worker's
-
-
-def _start_evaluator(task):
-    global _task
-    _task = task.fn
-    start_worker()
-
-
-def _in_worker(function, policy_file, *arguments):
+def _in_worker(function, file, *arguments):
     with telling_task_errors():
-        return function(pickle.loads(policy_file.read_bytes()), _task, *arguments)
+        return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
 
 
 class Run:
@@ -491,13 +473,11 @@ class Run:
 
     def _require_same_run(self, saved):
         config = plain_config(self.config) | {"run_dir": self.config.run_dir}  # a run cannot move
-        changed = [n for n in config if config[n] != saved[n] and n not in MAY_DIFFER_ON_RESUME]
-        if config["num_iterations"] < saved["num_iterations"]:
-            changed.append("num_iterations")
-        for name in changed:
-            flag = f"--{name.replace('_', '-')} {config[name]}"
-            what = "raise it" if name == "num_iterations" else "leave it out"
-            raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
+        for name, value in config.items():
+            shorter = name == "num_iterations" and value < saved[name]
+            if shorter or value != saved[name] and name not in MAY_DIFFER_ON_RESUME:
+                flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "leave it out"
+                raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
 
@@ -510,7 +490,7 @@ class Run:
             workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
             self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
             task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
-            self.pool = futures.ProcessPoolExecutor(workers, context, _start_evaluator, (task,))
+            self.pool = futures.ProcessPoolExecutor(workers, context, start_worker, (task,))
             self.stack.callback(self.pool.shutdown)
             list(self.pool.map(int, range(workers)))  # starts all: now, before anything uses a GPU or starts threads
             for worker in set(multiprocessing.active_children()).difference(others):
@@ -566,7 +546,6 @@ class Run:
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and "cuda" in own["random"]:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
-        environments.reset()
         if self.writes:
             self._start_files()
         bar = self.writes and getattr(sys.stderr, "isatty", bool)()
@@ -684,15 +663,14 @@ class Run:
                 self.found["best"] = row["average_return"], weights
                 self._save("best_policy.pt", "policy", {"weights": weights})
 
-    def _in_pool(self, function, policy, name, arguments):
-        """Futures of `function(policy, task, *arguments)` in the pool's workers, for each of these arguments."""
+    def _in_pool(self, function, large, name, arguments):
+        """Futures of `function(large, task, *arguments)` in the pool's workers, for each of these arguments."""
         file = self.scratch / name  # a queue would hang at a dead worker with what is larger than a pipe
-        file.write_bytes(pickle.dumps(policy))
+        file.write_bytes(pickle.dumps(large))
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
-    def _film(self, policies, name, *arguments):
-        arguments = evaluation_seeds(self.config)[0], self.path / name, *arguments
-        return self._in_pool(film, policies, name, [arguments])[0]
+    def _film(self, parts, name, *more):
+        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], self.path / name, *more)])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
@@ -730,13 +708,10 @@ class Run:
         policy, films = copy.deepcopy(policy).cpu(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
-            captions, weights = zip(*self.found["snapshots"])
-            learning = [copy.deepcopy(policy) for _ in weights]
-            for each, own in zip(learning, weights):
-                each.load_state_dict(own)
-            films["learning.mp4"] = self._film(learning, "learning.mp4", captions, 4, 25)
-            films["trained_agent.mp4"] = self._film([policy], "trained_agent.mp4")
-            films["random_agent.mp4"] = self._film([None], "random_agent.mp4")
+            learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]
+            films["learning.mp4"] = self._film(learning, "learning.mp4", 4, 25)
+            films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
+            films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
         with or_warn("exported policy", self.print):
             export_policy(self.path / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.found["best"][1])
@@ -787,7 +762,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
     print(f"{config.evaluate}: {text}")
     if config.video:
         with or_warn("video", print):
-            film([policy], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
+            film([(policy, None, None)], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
             print(f"filmed one episode: {path}")
 
 
@@ -817,10 +792,10 @@ def plot_learning_curve(path, tables, title, reward_threshold=None):
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
-def film(policies, task, seed, path, captions=(None,), seconds=math.inf, max_fps=50):
-    """Films the first `seconds` of one episode of each policy (None: random actions), in real time.
+def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
+    """Films the first `seconds` of an episode in real time, for each of `parts`, at most `max_fps` frames a second.
 
-    A policy's caption is written into its part. There are at most `max_fps` frames a second.
+    A part is a policy (None: random actions), its weights (None: those that it has), and a caption or None.
     """
     import imageio
     from PIL import Image, ImageDraw, ImageFont
@@ -835,14 +810,16 @@ def film(policies, task, seed, path, captions=(None,), seconds=math.inf, max_fps
         return np.asarray(image)
 
     def write(file):
-        skip = math.ceil(env.metadata["render_fps"] / max_fps)
-        fps = env.metadata["render_fps"] / skip
-        with contextlib.closing(imageio.get_writer(file.name, fps=fps, macro_block_size=2)) as video:
-            for policy, caption in zip(policies, captions):
+        rate = env.metadata["render_fps"]
+        skip = math.ceil(rate / max_fps)
+        with contextlib.closing(imageio.get_writer(file.name, fps=rate / skip, macro_block_size=2)) as video:
+            for policy, weights, caption in parts:
+                if weights:
+                    policy.load_state_dict(weights)
                 env.action_space.seed(seed)
                 observation, _ = env.reset(seed=seed)
                 done, step = False, 0
-                while not done and step < seconds * env.metadata["render_fps"]:
+                while not done and step < seconds * rate:
                     if step % skip == 0:
                         video.append_data(frame(caption))
                     action = policy.act(observation) if policy else env.action_space.sample()

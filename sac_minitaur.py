@@ -47,9 +47,9 @@ class Config:
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours, and 2018's (later: 10 000): transitions kept
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
-    actor_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the actor
-    critic_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for the critics
-    alpha_learning_rate: NonNegativeFloat = 3e-4  # Adam's, for log α
+    actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
+    critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
+    alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
@@ -65,7 +65,6 @@ class Config:
     initial_log_alpha: float = -2.0  # ours (theirs: 0): log α at the start; α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
-    observation_scaling: bool = True  # ours (theirs: no): standardize by mean and spread of the initial random data
     tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
     seed: common.Seed = 0  # source of all randomness
@@ -87,9 +86,9 @@ class Config:
 
 
 TUTORIAL = dict(
-    replay_buffer_capacity=10_000, adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False,
-    reward_scaling=False, reward_scale_factor=1.0, averaged_actor_tau=1.0, mean_action_episodes=False,
-    target_entropy_per_action=-0.5, initial_log_alpha=0.0, observation_scaling=False,
+    replay_buffer_capacity=10_000, actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
+    adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False, reward_scale_factor=1.0,
+    averaged_actor_tau=1.0, mean_action_episodes=False, target_entropy_per_action=-0.5, initial_log_alpha=0.0,
 )  # fmt: skip
 
 
@@ -114,27 +113,6 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
     return nn.Sequential(*layers[:-1])  # no ReLU after the outputs
 
 
-class ObservationScaling(nn.Module):
-    """Standardizes observations (…, S) by a fixed mean and deviation, clipped to ±10; the identity until `fit`."""
-
-    def __init__(self, observation_size):
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(observation_size))
-        self.register_buffer("std", torch.ones(observation_size))
-        self.register_buffer("limit", torch.full((observation_size,), torch.inf))
-
-    def fit(self, observations, ranks):
-        """Takes mean and standard deviation from observations (N, S) of all ranks."""
-        mean, std = ranks.mean_and_std(observations)
-        self.mean.copy_(mean)
-        # A number that is still under random actions may move later: its deviation counts as 0.01 or more.
-        self.std.copy_(std.clamp(min=0.01))
-        self.limit.fill_(10.0)
-
-    def forward(self, observation):
-        return ((observation - self.mean) / self.std).clamp(-self.limit, self.limit)
-
-
 class Actor(nn.Module):
     """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O numbers of an observation."""
 
@@ -144,7 +122,7 @@ class Actor(nn.Module):
         self.net = mlp(observation_size, hidden_layers, 2 * action_size)
 
     def forward(self, observation):
-        """Mean and log standard deviation before squashing, (…, A) each, for scaled observations (…, O or more)."""
+        """Mean and log standard deviation before squashing, (…, A) each, for observations (…, O or more)."""
         mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
         return mean, log_std.clamp(-20, 2)
 
@@ -171,7 +149,7 @@ class TwinCritics(nn.Module):
         self.q2 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
 
     def forward(self, observation, action):
-        """(2, …) for scaled observations (…, S) and actions (…, A)."""
+        """(2, …) for observations (…, S) and actions (…, A)."""
         x = torch.cat((observation, action), dim=-1)
         return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
 
@@ -182,20 +160,19 @@ class Policy(nn.Module):
     def __init__(self, config, observation_space, action_space):
         super().__init__()
         self.action_space = action_space
-        observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
-        self.scaling = ObservationScaling(observation_size)
-        self.actor = Actor(observation_size, action_size, config.actor_layers)
+        sizes = math.prod(observation_space.shape), math.prod(action_space.shape)
+        self.actor = Actor(*sizes, config.actor_layers)
         self.register_buffer("low", torch.as_tensor(action_space.low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(action_space.high, dtype=torch.float32))
 
     def forward(self, observation):
-        """Actions (batch, *action shape) for raw observations (batch, *observation shape)."""
-        mean, _ = self.actor(self.scaling(observation.flatten(1)))
+        """Actions (batch, *action shape) for observations (batch, *observation shape)."""
+        mean, _ = self.actor(observation.flatten(1))
         return to_bounds(mean.tanh().unflatten(1, self.low.shape), self.low, self.high)
 
     @torch.inference_mode()
     def act(self, observation):
-        """The action for one raw observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
+        """The action for one observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
         action = self(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
         require_finite(action)
         return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
@@ -243,10 +220,10 @@ class ReplayBuffer:
         observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
 
-    def observations_and_rewards(self):
-        """All that is stored of these: (size, S), (size,)."""
-        observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
-        return observations, rewards.squeeze(1)
+    def rewards(self):
+        """All that are stored: (size,)."""
+        _, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
+        return rewards.squeeze(1)
 
     def state_dict(self):
         """A copy of the filled part, for a checkpoint."""
@@ -300,7 +277,6 @@ class SACAgent(nn.Module):
         self.config, self.device, self.ranks, self.action_shape = config, device, ranks, action_space.shape
         observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
-        self.scaling = ObservationScaling(state_size)
         self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))
         self.actor = Actor(observation_size, action_size, config.actor_layers)
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
@@ -325,15 +301,14 @@ class SACAgent(nn.Module):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
-    @torch.no_grad()
-    def fit_scaling(self, observations, rewards):
-        """Sets the scales of observations and rewards from observations (N, S) and rewards (N,) of all ranks."""
-        if self.config.observation_scaling:
-            self.scaling.fit(observations, self.ranks)
-            for own, full in zip(self.policy.scaling.buffers(), self.scaling.buffers()):
-                own.copy_(full[: len(own)])  # the policy does not see what only the critics see
+    def fit_reward_scale(self, rewards):
+        """Divides the scale of rewards by the standard deviation of the rewards (N,) of all ranks."""
         if self.config.reward_scaling:
-            _, std = self.ranks.mean_and_std(rewards)
+            mean = rewards.mean()
+            self.ranks.average([mean])  # in place, over the processes
+            variance = (rewards - mean).square().mean()
+            self.ranks.average([variance])
+            std = variance.sqrt()
             self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
 
     @torch.no_grad()
@@ -342,7 +317,7 @@ class SACAgent(nn.Module):
 
         True in `deterministic` (K,) takes the evaluated policy's action, False samples the actor's.
         """
-        observations = self.scaling(torch.as_tensor(observations, dtype=torch.float32, device=self.device))
+        observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
         actions, _ = self.actor.sample(observations)
         mean, _ = self.policy.actor(observations)
         actions = torch.where(torch.as_tensor(deterministic, device=self.device)[:, None], mean.tanh(), actions)
@@ -358,7 +333,6 @@ class SACAgent(nn.Module):
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
-        s, next_s = self.scaling(s), self.scaling(next_s)
         rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
@@ -499,7 +473,7 @@ def train(config):
                     actions = agent.act(envs.observations, deterministic)
                 envs.step_async(actions)
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:  # not in the last warm-up step: first fit_scaling, then evaluate
+            if env_steps >= due and not warming_up:  # in the warm-up's last step comes the reward scale
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
                 run.progress.update()
@@ -508,7 +482,7 @@ def train(config):
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
                 if warming_up and env_steps >= config.initial_collect_steps:
-                    agent.fit_scaling(*buffer.observations_and_rewards())
+                    agent.fit_reward_scale(buffer.rewards())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 

@@ -57,7 +57,7 @@ def gradients_of_update(module, ranks):
         agent.fit_scaling(batch[0], batch[2])
         agent.update(batch, 0)
     else:
-        agent.fit_scaling(batch[0], batch[2])
+        agent.fit_reward_scale(batch[2])
         agent.update(batch)
     return [p.grad for optimizer in agent.optimizers for group in optimizer.param_groups for p in group["params"]]
 

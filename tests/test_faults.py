@@ -115,8 +115,8 @@ def test_damaged_or_foreign_file(script, copy, tmp_path, name):  # noqa: F811
 def test_checkpoint_of_another_version(script, copy):  # noqa: F811
     """It has a field more or one less: what that would have to be, nobody knows."""
     config = checkpoint(copy)["config"]
-    older = {name: value for name, value in config.items() if name != "observation_scaling"}
-    for changed, field in ((older, "observation_scaling"), (config | {"wings": 2}, "wings")):
+    older = {name: value for name, value in config.items() if name != "gamma"}
+    for changed, field in ((older, "gamma"), (config | {"wings": 2}, "wings")):
         change(copy / "checkpoint.pt", config=changed)
         message = refusal(script, "--resume", copy)
         assert "another version" in message and field in message
@@ -449,7 +449,7 @@ class Blinking(gym.Env):
 
 def film(path, **arguments):
     task = gym.envs.registration.EnvSpec("Blinking-v0", Blinking, disable_env_checker=True, kwargs=arguments)
-    common.film([None], task, 0, path)
+    common.film([(None, None, None)], task, 0, path)
 
 
 def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):

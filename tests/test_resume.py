@@ -136,7 +136,7 @@ def test_reference_is_worth_comparing_with(script, reference):
     state = checkpoint(reference)
     own = state["ranks"][0]
     assert state["step"] == 300 and len(own["buffer"]["rows"]) == 250
-    assert any(len(actions) > 0 for _, actions, _ in own["environments"]["episodes"])
+    assert any(len(actions) > 0 for _, actions in own["environments"]["episodes"])
     assert [row[0] for row in rows(reference / "eval.csv")] == ["step", "0", "100", "200", "300"]
     assert [row[0] for row in rows(reference / "train.csv")] == ["step", *map(str, range(20, 301, 20))]
     # The speed is that of the updates since the last row.

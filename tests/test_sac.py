@@ -21,14 +21,15 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 import common
 import sac_minitaur
-from sac_minitaur import Actor, Config, ObservationScaling, Policy, ReplayBuffer, SACAgent
+from sac_minitaur import Actor, Config, Policy, ReplayBuffer, SACAgent
 
 ROOT = Path(__file__).parent.parent
 # The tutorials' values, here written down a second time.
 TUTORIALS = dict(
+    actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
     adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False,
     reward_scale_factor=1, averaged_actor_tau=1, mean_action_episodes=False, target_entropy_per_action=-0.5,
-    initial_log_alpha=0, observation_scaling=False, replay_buffer_capacity=10_000,
+    initial_log_alpha=0, replay_buffer_capacity=10_000,
 )  # fmt: skip
 
 
@@ -162,30 +163,12 @@ def test_twin_critics_are_independent():
     assert not any(parameter.grad.any() for parameter in critics.q2.parameters())
 
 
-def test_observation_scaling():
-    scaling = ObservationScaling(3)
-    observations = torch.tensor([[1.0, 10.0, 7.0], [3.0, 30.0, 7.0]])
-    far = torch.tensor([[1e6, -1e6, 0.0]])
-    assert torch.equal(scaling(observations), observations) and torch.equal(scaling(far), far)
-    scaling.fit(observations, common.Ranks())
-    assert scaling(observations).tolist() == [[-1, -1, 0], [1, 1, 0]]
-    assert scaling(far).tolist() == [[10, -10, -10]]
-    # The third never moved; its spread counts as 0.01.
-    near = scaling(torch.tensor([[2.0, 20.0, 7.02]]))
-    torch.testing.assert_close(near, torch.tensor([[0.0, 0.0, 2.0]]), atol=1e-3, rtol=0)
-    other = ObservationScaling(3)
-    other.load_state_dict(scaling.state_dict())
-    assert torch.equal(other(far), scaling(far))
-
-
 def test_policy_acts_with_the_mean_in_the_tasks_units():
     action_space = gym.spaces.Box(np.float32([[0, -3], [-1, 5]]), np.float32([[10, 1], [1, 6]]))
     policy = Policy(Config(actor_layers=(16,)), gym.spaces.Box(-1, 1, (2, 3)), action_space)
-    scaling, actor = policy.scaling, policy.actor
-    scaling.fit(torch.randn(100, 6), common.Ranks())
-    observations = torch.randn(5, 2, 3)
+    actor, observations = policy.actor, torch.randn(5, 2, 3)
     actions = policy(observations)
-    mean, _ = actor(scaling(observations.flatten(1)))
+    mean, _ = actor(observations.flatten(1))
     squashed = mean.tanh().view(5, 2, 2)
     expected = torch.tensor([[5.0, -1.0], [0.0, 5.5]]) + torch.tensor([[5.0, 2.0], [1.0, 0.5]]) * squashed
     torch.testing.assert_close(actions, expected)
@@ -252,8 +235,7 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     assert counts[:2].tolist() == [0, 0] and counts[2:].min() > 850 and len(counts) == 7
     pairs = zip(*(column.tolist() for column in buffer.sample(200)[2:4]))
     assert set(pairs) == {(100, 0), (1000, 1), (1e4, 0), (1e5, 0), (1e6, 0)}
-    observations, rewards = buffer.observations_and_rewards()
-    assert sorted(observations[:, 0].tolist()) == [2, 3, 4, 5, 6] and rewards.shape == (5,)
+    assert sorted(buffer.rewards().tolist()) == [1e2, 1e3, 1e4, 1e5, 1e6]
 
 
 @pytest.mark.parametrize("stored, position", [(3, 2), (8, 2)])
@@ -279,9 +261,9 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     choices = dict(adam_epsilon=1e-2, critic_learning_rate=1e-3, actor_learning_rate=2e-3, alpha_learning_rate=3e-3)
     agent = make_agent(**choices, critic_batch_norm=batch_norm)
     config, batch = agent.config, make_batch()
-    agent.fit_scaling(5 * batch[0] + 1, 3 * batch[2])
-    observations, next_observations = agent.scaling(batch[0]), agent.scaling(batch[4])
-    actions, rewards, terminated = batch[1], agent.reward_scale * batch[2], batch[3]
+    agent.fit_reward_scale(3 * batch[2])
+    observations, actions, rewards, terminated, next_observations = batch
+    rewards = agent.reward_scale * rewards
     alpha = agent.log_alpha.exp().item()
     with torch.no_grad():
         followers = (agent.policy.actor,) if batch_norm else (agent.policy.actor, agent.target_critics)
@@ -356,20 +338,18 @@ def test_update_learns_from_terminated_and_truncated_differently():
 
 def test_act_samples_or_takes_the_mean():
     agent = make_agent()
-    agent.fit_scaling(torch.randn(50, 3), torch.randn(50))
     agent.update(make_batch())  # so that the averaged actor is not the actor
     observations = torch.randn(4, 3)
     torch.manual_seed(7)
     actions = torch.from_numpy(agent.act(observations.numpy(), np.array([False, True, True, False])))
     torch.manual_seed(7)
-    sampled, _ = agent.actor.sample(agent.scaling(observations))
+    sampled, _ = agent.actor.sample(observations)
     assert torch.equal(actions[::3], sampled[::3].detach())
     torch.testing.assert_close(actions[1:3], agent.policy(observations)[1:3].detach())
 
 
 def test_only_the_critics_see_the_end_of_a_longer_observation():
     agent = make_agent(observation_size=3, state_size=5)
-    agent.fit_scaling(7 + 2 * torch.randn(50, 5), torch.randn(50))
     agent.update(make_batch(observation_size=5))
     observations = torch.randn(4, 5)
     others = torch.cat((observations[:, :3], torch.randn(4, 2)), dim=1)
@@ -392,19 +372,16 @@ def test_alpha_moves_towards_the_target_entropy(target_entropy, direction):
     assert direction * moved == pytest.approx(3 * agent.config.alpha_learning_rate, rel=0.01)
 
 
-def test_fit_scaling():
+def test_fit_reward_scale():
     agent = make_agent(reward_scale_factor=6.0)
-    observations = torch.tensor([[1.0, 10.0, 7.0], [3.0, 30.0, 7.0]])
-    agent.fit_scaling(observations, torch.tensor([-0.001, 0.005]))  # about as much as the Minitaur's
+    agent.fit_reward_scale(torch.tensor([-0.001, 0.005]))  # about as much as the Minitaur's
     assert agent.reward_scale.item() == pytest.approx(6 / 0.003)
-    assert agent.scaling.mean.tolist() == [2, 20, 7]
-    assert agent.policy.scaling.mean.tolist() == [2, 20, 7]  # it is evaluated and exported with the policy
 
 
 @pytest.mark.parametrize("reward", [0.0, 0.1, 1.0])
 def test_rewards_that_are_all_equal_keep_their_scale(reward):
     agent = make_agent(reward_scale_factor=2.0)
-    agent.fit_scaling(torch.randn(1000, 3), torch.full((1000,), reward))
+    agent.fit_reward_scale(torch.full((1000,), reward))
     assert agent.reward_scale.item() == 2.0
 
 
@@ -422,7 +399,7 @@ def test_the_tutorials_values_are_the_defaults():
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     lines = Path(sac_minitaur.__file__).read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
-    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 11
+    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 13
     assert Config(tutorial=True) == Config(**TUTORIALS, tutorial=True)
     assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
 
@@ -438,9 +415,7 @@ def test_flags_beside_tutorial_still_count(monkeypatch):
 
 def test_the_tutorials_agent():
     agent = make_agent(**TUTORIALS)
-    observations = 100 * torch.randn(50, 3)
-    agent.fit_scaling(observations, 7 * torch.randn(50))
-    assert torch.equal(agent.scaling(observations), observations)
+    agent.fit_reward_scale(7 * torch.randn(50))
     assert agent.reward_scale == 1 and agent.log_alpha.exp() == 1 and agent.target_entropy == -2 / 2
     assert not any(isinstance(module, nn.BatchNorm1d) for module in agent.critics.modules())
     assert agent.target_critics and not make_agent().target_critics
@@ -454,7 +429,7 @@ def test_an_update_reads_and_creates_nothing_on_another_device(monkeypatch, choi
     agent = make_agent(device="meta", state_size=5, **choices)
     buffer = ReplayBuffer(40, 5, 2, agent.device)
     buffer.size = 40
-    agent.fit_scaling(*buffer.observations_and_rewards())
+    agent.fit_reward_scale(buffer.rewards())
     metrics = agent.update(buffer.sample(32))
     assert {value.device for value in metrics.values()} == {agent.device}
 
@@ -471,7 +446,7 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
         draws = iter(noise)
         monkeypatch.setattr(torch, "randn_like", lambda mean: next(draws).to(mean.device))
         batch = tuple(tensor.to(agent.device) for tensor in make_batch(observation_size=5))
-        agent.fit_scaling(batch[0], batch[2])
+        agent.fit_reward_scale(batch[2])
         metrics = agent.update(batch)
         results.append({name: value.cpu() for name, value in (metrics | agent.state_dict()).items()})
     torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)
@@ -532,7 +507,7 @@ TINY = dict(
 
 
 def train(path, **choices):
-    """A tiny run. Returns its directory and the agent's calls, in order: fit_scaling with its data, and update."""
+    """A tiny run. Returns its directory and the agent's calls, in order: fit_reward_scale with its data, and update."""
     calls = []
 
     def recorded(name):
@@ -545,7 +520,7 @@ def train(path, **choices):
         return call
 
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("update", "fit_scaling"):
+        for name in ("update", "fit_reward_scale"):
             patch.setattr(SACAgent, name, recorded(name))
         torch.set_num_threads(2)
         returned = sac_minitaur.train(Config(**TINY | {"run_dir": str(path)} | choices))
@@ -579,9 +554,9 @@ def tiny_run(tmp_path_factory):
 
 def test_train_does_what_the_config_says(tiny_run):
     path, calls = tiny_run
-    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"]
-    observations, rewards = calls[0][1]
-    assert observations.shape == (250, 3) and rewards.shape == (250,)
+    assert [name for name, _ in calls] == ["fit_reward_scale"] + 60 * ["update"]
+    (rewards,) = calls[0][1]
+    assert rewards.shape == (250,)
     assert all(batch[0].shape == (32, 3) for _, (batch,) in calls[1:])
     shared, own = read_checkpoint(path)
     assert shared["step"] == 60 and shared["env_steps"] == len(own["buffer"]["rows"]) == 250 + 60
@@ -684,8 +659,8 @@ def test_every_second_episode_is_collected_by_the_mean_action(mean_action_episod
 
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
     path, calls = train(tmp_path / "run", num_envs=3)
-    # 250 is no multiple of 3. The scaling is fitted before the first update all the same, on all there is.
-    assert [name for name, _ in calls] == ["fit_scaling"] + 60 * ["update"] and len(calls[0][1][0]) == 252
+    # 250 is no multiple of 3. The scale is fitted before the first update all the same, on all there is.
+    assert [name for name, _ in calls] == ["fit_reward_scale"] + 60 * ["update"] and len(calls[0][1][0]) == 252
     assert all(row["env_steps"] - 250 - row["step"] in range(6) for row in read_csv(path / "train.csv"))
     shared, own = read_checkpoint(path)
     assert shared["env_steps"] == len(own["buffer"]["rows"]) == 312
@@ -696,7 +671,7 @@ def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path)
 def test_several_steps_per_update_and_a_small_buffer(tmp_path):
     path, calls = train(tmp_path / "run", collect_steps_per_iteration=3, num_iterations=20, replay_buffer_capacity=100)
     shared, own = read_checkpoint(path)
-    assert [name for name, _ in calls] == ["fit_scaling"] + 20 * ["update"]
+    assert [name for name, _ in calls] == ["fit_reward_scale"] + 20 * ["update"]
     assert shared["env_steps"] == 250 + 3 * 20 and len(own["buffer"]["rows"]) == 100
 
 

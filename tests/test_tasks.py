@@ -96,7 +96,7 @@ def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
     assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
     torch.testing.assert_close(next_observations[:, 1:], actions if high == 1 else 1 + 2 * actions)
     # Those of the running episodes, to be played again on resume.
-    assert all(len(actions) == 2 and actions.abs().max() <= 1 for _, actions, _ in own["environments"]["episodes"])
+    assert all(len(actions) == 2 and actions.abs().max() <= 1 for _, actions in own["environments"]["episodes"])
 
 
 @pytest.mark.parametrize(
