@@ -390,7 +390,6 @@ def test_the_tutorials_values_are_the_defaults():
     assert config.env_id == "MinitaurBulletEnv-v0" and config.num_iterations == 100_000
     assert config.initial_collect_steps == 10_000 and config.collect_steps_per_iteration == 1
     assert config.batch_size == 256 and config.gamma == 0.99 and config.target_update_tau == 0.005
-    assert config.actor_learning_rate == config.critic_learning_rate == config.alpha_learning_rate == 3e-4
     assert config.actor_layers == config.critic_layers == (256, 256)
     assert (config.log_interval, config.eval_interval, config.num_eval_episodes) == (5_000, 10_000, 20)
     assert config.checkpoint_interval == 5_000 and config.critic_loss_weight == 0.5
