@@ -513,8 +513,7 @@ class Run:
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules[type(self.config).__module__]  # a fork's script has a name of its own
         program = Path(getattr(module, "__file__", f"{self.script}.py")).name
-        arguments = shlex.join([program, "--resume", str(self.path)])
-        return f"to continue from the last checkpoint: {python} {arguments}"
+        return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
@@ -773,9 +772,8 @@ def plot_learning_curve(path, tables, title, reward_threshold=None):
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     returns, losses, values = figure.subplots(1, 3)
-    steps, mean, spread = (
-        np.array([row[key] for row in tables["eval"]]) for key in ("step", "average_return", "std_return")
-    )
+    points = [(row["step"], row["average_return"], row["std_return"]) for row in tables["eval"]]
+    steps, mean, spread = np.reshape(points, (-1, 3)).T
     returns.plot(steps, mean, marker=".", label="deterministic policy, mean ± std")
     returns.fill_between(steps, mean - spread, mean + spread, alpha=0.2)
     for row in tables["random"]:
