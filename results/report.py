@@ -5,9 +5,8 @@
 
 import csv
 import math
-from itertools import pairwise
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 
 from matplotlib.figure import Figure
 
@@ -17,10 +16,9 @@ FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_minitaur": "ours", "sac_unprivileged": "ours without privileged critics"},
+        {"sac_minitaur": "ours", "sac_three_step": "ours until b02bd46"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
-    "sac_minitaur_long": ("SAC on the Minitaur, longer runs", 15.0, {"sac_minitaur_long": "ours"}, ()),
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
@@ -84,20 +82,6 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_stretches(experiment, ends):
-    """The mean of each seed's evaluations after each of the steps `ends`, up to and with the next."""
-    stretches = list(pairwise(ends))
-    titles = [f"{start} to {end}" for start, end in stretches]
-    print(f"\n### {experiment}, means\n\n| seed | at {ends[0]} | {' | '.join(titles)} | last | its step | best |")
-    print(f"|{' --- |' * (len(ends) + 4)}")
-    for seed, rows in runs(experiment).items():
-        at = returns_by_step(rows)
-        within = [[value for step, value in at.items() if start < step <= end] for start, end in stretches]
-        means = [mean(values) if values else math.nan for values in within]
-        print(f"| {seed} | {' | '.join(map(number, [at[ends[0]], *means]))}", end="")
-        print(f" | {with_spread(rows[-1])} | {rows[-1]['step']:.0f} | {max(at.values()):.2f} |")
-
-
 def print_ablation(base, step, more):
     """Returns after `step` updates of `base`, of the runs without one choice, and of `more`, with the seeds of all."""
     without = f"{base}_without_"
@@ -154,9 +138,8 @@ def main():
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
-    print_stretches("sac_minitaur_long", (100_000, 200_000, 400_000, 600_000, 800_000, 1_000_000))
     exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
-    print_ablation("sac_minitaur", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
+    print_ablation("sac_three_step", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
     print_ablation("sac_unprivileged", 30_000, {})
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
