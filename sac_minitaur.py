@@ -240,8 +240,7 @@ class ReplayBuffer:
 def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
     """r + γ (1 − terminated) (min over the twins of Q(s', a') − α log π(a'|s')): (B,).
 
-    next_q (2, B), alpha and gamma scalars, the rest (B,). Equations 3 and 5 of arXiv:1812.05905, with the twins'
-    minimum.
+    next_q (2, B), alpha and gamma scalars, the rest (B,). Equations 3 and 5 of arXiv:1812.05905, for two critics.
     """
     return rewards + gamma * (1 - terminated) * (next_q.amin(0) - alpha * next_log_probs)
 
@@ -501,18 +500,12 @@ def train(config):
 class Dynamics:
     """What the Minitaur draws anew at every reset. Ranges: pybullet's minitaur_env_randomizer.py."""
 
-    base_mass: float
-    """kg, the model's × U(0.8, 1.2)"""
-    leg_mass: float
-    """kg, of each of the 16 leg links, the model's × U(0.8, 1.2)"""
-    motor_mass: float
-    """kg, of each of the 8 motors, the model's × U(0.8, 1.2)"""
-    voltage: float
-    """V, the battery's, U(14.8, 16.8)"""
-    viscous_damping: float
-    """N·m·s/rad, the motors', U(0, 0.01)"""
-    foot_friction: float
-    """lateral friction coefficient of the feet, U(0.8, 1.5)"""
+    base_mass: float  # kg, the model's × U(0.8, 1.2)
+    leg_mass: float  # kg, of each of the 16 leg links, the model's × U(0.8, 1.2)
+    motor_mass: float  # kg, of each of the 8 motors, the model's × U(0.8, 1.2)
+    voltage: float  # V, the battery's, U(14.8, 16.8)
+    viscous_damping: float  # N·m·s/rad, the motors', U(0, 0.01)
+    foot_friction: float  # lateral friction coefficient of the feet, U(0.8, 1.5)
 
 
 class Simulator:
