@@ -61,7 +61,7 @@ class Config:
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): part of its way to the actor that the policy moves
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours, the paper's (theirs: −0.5): α's aim, times an action's size
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each number of an action
     initial_log_alpha: float = -2.0  # ours (theirs: 0): log α at the start; α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
@@ -472,7 +472,7 @@ def train(config):
                     actions = agent.act(envs.observations, deterministic)
                 envs.step_async(actions)
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:  # in the warm-up's last step comes the reward scale
+            if env_steps >= due and not warming_up:  # not before the reward scale is fitted
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
                 run.progress.update()
