@@ -138,9 +138,8 @@ def main():
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
-    exact = {"any of ours": "sac_unprivileged_without_any_of_ours"}
-    print_ablation("sac_three_step", 20_000, {"privileged_critics": "sac_unprivileged"} | exact)
-    print_ablation("sac_unprivileged", 30_000, {})
+    more = {"privileged_critics": "sac_unprivileged", "any of ours": "sac_tutorial"}
+    print_ablation("sac_three_step", 20_000, more)
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
