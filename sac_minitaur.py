@@ -62,7 +62,7 @@ class Config:
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each number of an action
-    initial_log_alpha: float = -2.0  # ours (theirs: 0): log α at the start; α weighs the entropy against Q
+    initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
     tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
@@ -88,7 +88,7 @@ class Config:
 TUTORIAL = dict(
     replay_buffer_capacity=10_000, actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
     adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False, reward_scale_factor=1.0,
-    averaged_actor_tau=1.0, mean_action_episodes=False, target_entropy_per_action=-0.5, initial_log_alpha=0.0,
+    averaged_actor_tau=1.0, mean_action_episodes=False, target_entropy_per_action=-0.5,
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_minitaur": "ours", "sac_three_step": "ours until b02bd46"},
+        {"sac_log_alpha_-2": "ours", "sac_three_step": "ours until b02bd46"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "dqn_cartpole": (
@@ -136,6 +136,8 @@ def main():
     for name in sorted({path.parts[-3] for path in RESULTS.glob("*/seed*/eval.csv")}):
         if name in ("dqn_cartpole", "dqn_cartpole_v1", "dqn_cartpole_130000"):
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
+        elif "pendulum" in name:
+            print_table(name, goal=-200, late=5_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
     more = {"privileged_critics": "sac_unprivileged", "any of ours": "sac_tutorial"}
