@@ -353,8 +353,8 @@ class Environments:
             self.vector.step_async(actions)
 
     def step_wait(self):
-        """The transitions of that step: observations (K, …), actions (K, …), rewards (K,), terminated (K,), truncated
-        (K,), next observations (K, …). The last are the true ones where an episode has ended and was reset."""
+        """The transitions of that step: observations (K, …), actions (K, …), rewards (K,), terminated (K,), next
+        observations (K, …). The last are the true ones where an episode has ended and was reset."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
@@ -362,7 +362,7 @@ class Environments:
             next_observations[i] = infos["final_obs"][i]
             self.finished.append((float(infos["final_info"]["return"][i]), int(infos["final_info"]["length"][i])))
         self.num_episodes += terminated | truncated
-        return observations, self.actions, rewards, terminated, truncated, next_observations
+        return observations, self.actions, rewards, terminated, next_observations
 
     def recent(self):
         """The mean return and length of the last 10 episodes that ended (nan before the first)."""

@@ -7,6 +7,10 @@
     python dqn_cartpole.py --tutorial                         # the tutorial's own choices, which are less stable
     torchrun --nproc-per-node 2 dqn_cartpole.py               # two processes, one agent
 
+The Q-network estimates Q(s, a), the discounted sum of the rewards after action a in state s. Each update moves Q(s, a)
+towards r + γ max Q(s', ·). A slow copy of it, the target network, computes that maximum, so that the goal moves slowly.
+The policy takes the action of the largest Q. While it collects data, some actions are random: so it explores.
+
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
 "ours" in `Config`. README gives the reasons.
@@ -50,9 +54,9 @@ class Config:
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
-    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): part of its way the target network moves an update
-    value_unit: bool = True  # ours (theirs: no): Q = (mean reward + mean |reward| × network's output) / (1 − γ)
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): weight of action_gap in a target
+    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
+    value_unit: bool = True  # ours (theirs: no): give Q the unit of the worth of an endless episode
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): the part of action_gap that is taken off a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
     tutorial: bool = False  # set every value marked "ours" back to the tutorial's; other flags override it
@@ -102,8 +106,8 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops the bounds that are more than 1000 times the largest value in observations (N, O)."""
-        ranks.average([largest := (observations - self.center).abs().amax(0)])
+        """Drops bounds over 1000 times as wide as observations (N, O): these would all come to 0."""
+        ranks.average([largest := (observations - self.center).abs().amax(0)])  # in place, over the processes
         beyond = self.half_range > 1000 * largest
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
@@ -114,11 +118,11 @@ class ObservationScaling(nn.Module):
 class QNetwork(nn.Module):
     """Q(s, ·), the estimated return of every action.
 
-    ReLU layers with weights from a normal distribution of variance 2 / inputs, truncated at two standard deviations,
-    and zero biases; a last layer with weights from U(−0.03, 0.03) and biases −0.2 (the tutorial's initialization).
+    It starts as the tutorial's. ReLU layers: weights from a normal distribution of variance 2 / inputs, truncated at
+    two standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
     """
 
-    # A standard normal truncated at ±2 has this standard deviation; Keras divides by it, so that 2 / inputs is exact.
+    # The standard deviation of a standard normal truncated at ±2. We divide by it, as Keras does.
     TRUNCATED_STD = 0.87962566103423978
 
     def __init__(self, observation_size, num_actions, hidden_layers):
@@ -173,8 +177,8 @@ class ReplayBuffer:
         self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
 
-    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Stores K transitions, numpy arrays (K, O) and (K,). A full buffer overwrites its oldest."""
+    def add(self, observations, actions, rewards, terminated, next_observations):
+        """Stores K transitions, numpy arrays (K, O), (K,). A full buffer overwrites its oldest."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
         for row in rows:
@@ -183,7 +187,7 @@ class ReplayBuffer:
             self.size = min(self.size + 1, len(self.rows))
 
     def sample(self, batch_size):
-        """A random batch, which mixes many episodes: (B, O), (B,) of int64, (B,), (B,), (B, O)."""
+        """A batch drawn uniformly with replacement: (B, O), (B,) of int64, (B,), (B,), (B, O)."""
         indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
         observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
@@ -216,7 +220,10 @@ def action_gap(q, actions):
 
 
 class DQNAgent(nn.Module):
-    """The Q-network, its slow copy for steady targets, the optimizer, and the greedy policy that is evaluated."""
+    """The Q-network, its slow copy for steady targets, the optimizer, and the greedy policy that is evaluated.
+
+    `ranks` are the processes of torchrun. Where there is one, its `average` does nothing.
+    """
 
     def __init__(self, config, observation_space, action_space, device, ranks):
         super().__init__()
@@ -311,8 +318,7 @@ def evaluate(policy, task, seed):
 
 def make_training_env(task):
     """The task with flat observations, as the agent sees it."""
-    env = gym.make(task)
-    return env if len(env.observation_space.shape) == 1 else gym.wrappers.FlattenObservation(env)
+    return gym.wrappers.FlattenObservation(gym.make(task))
 
 
 def train(config):
@@ -325,7 +331,7 @@ def train(config):
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
         batch_size = run.ranks.batch_share(config)
-        # In this process: a message to a worker costs more than a step of CartPole.
+        # They step in this process: a message to a worker takes longer than a step of CartPole.
         envs = common.Environments(partial(make_training_env, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
@@ -350,7 +356,7 @@ def train(config):
                 env_steps += config.num_envs * run.ranks.world_size
                 if warming_up and env_steps >= config.initial_collect_steps:
                     agent.fit_scaling(*buffer.observations_and_rewards())
-            if env_steps >= due and not warming_up:  # the first evaluation and the scales come before
+            if env_steps >= due and not warming_up:  # not before the scales are fitted
                 metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
                 run.progress.update()

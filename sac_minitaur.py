@@ -44,7 +44,7 @@ class Config:
     initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
-    replay_buffer_capacity: PositiveInt = 1_000_000  # ours, and 2018's (later: 10 000): transitions kept
+    replay_buffer_capacity: PositiveInt = 1_000_000  # ours, 2018's (later: 10 000): transitions kept by each process
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
@@ -54,11 +54,11 @@ class Config:
     adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
-    target_update_tau: common.Fraction = 0.005  # part of their way that the target critics, if any, move an update
+    target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
     gamma: common.Fraction = 0.99  # discount
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): part of its way to the actor that the policy moves
+    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each number of an action
@@ -92,7 +92,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The networks (shapes: B batch, K environments, N stored, O numbers observed, S seen by the critics, A in an action)
+# The networks (shapes: B batch, K environments, N stored, O numbers observed, S that the critics see, A of an action)
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -204,8 +204,8 @@ class ReplayBuffer:
         self.rows = common.empty_replay(capacity, sum(self.sizes), device)
         self.size = self.position = 0
 
-    def add(self, observations, actions, rewards, terminated, truncated, next_observations):
-        """Stores K transitions: arrays (K, S), (K, *action shape) and (K,). A full buffer overwrites its oldest."""
+    def add(self, observations, actions, rewards, terminated, next_observations):
+        """Stores K transitions, numpy arrays (K, S), (K, *action shape), (K,). A full buffer overwrites its oldest."""
         actions = actions.reshape(len(actions), -1)
         columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
@@ -335,14 +335,14 @@ class SACAgent(nn.Module):
         rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
-        # The critics: Q(s, a) moves towards y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s').
+        # The critics: Q(s, a) moves to y = r + γ (1 − terminated) (min Q(s', a') − α log π(a'|s')), a' ~ π(·|s').
         with torch.no_grad():
             next_a, next_log_probs = self.actor.sample(next_s)  # (B, A), (B,)
         if self.target_critics:
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # One pass, as in CrossQ: the same statistics normalize the replay's and the actor's actions. No gradient
+            # One pass, as in CrossQ: batch norm takes one mean and variance over (s, a) and (s', a'). No gradient
             # reaches next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
@@ -371,12 +371,12 @@ class SACAgent(nn.Module):
             "mean_q": q.detach().mean(),
         }
 
-    def _step(self, optimizer, loss, statistics=()):
+    def _step(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         optimizer.zero_grad()
         loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
         # Several processes: the mean of their gradients, and of batch normalization's running statistics.
-        statistics = [buffer for buffer in statistics if buffer.is_floating_point()]
+        statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]
         self.ranks.average([parameter.grad for parameter in parameters] + statistics)
         optimizer.step()
 
@@ -429,8 +429,7 @@ def make_training_env(task, privileged):
     if (low != -1).any() or (high != 1).any() or dtype != np.float32:
         unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
         env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
-    if len(env.observation_space.shape) != 1:
-        env = gym.wrappers.FlattenObservation(env)
+    env = gym.wrappers.FlattenObservation(env)
     return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
 
 
@@ -511,7 +510,7 @@ class Dynamics:
 class Simulator:
     """A simulation of its own in this process, with pybullet's functions as methods.
 
-    It ends when nothing refers to it any more. pybullet's own `BulletClient` prints a line for every simulation.
+    Python's garbage collection disconnects it. pybullet's own `BulletClient` would print a line for each simulation.
     """
 
     def __init__(self):
@@ -539,7 +538,7 @@ class MinitaurBulletEnv(gym.Env):
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
     orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
-    Reward: metres forward in this step less 0.005 × 0.002 s × the mechanical power in W.
+    Reward: metres forward in this step less 0.005 × 0.002 s × |observed torques · motor velocities| in W.
     Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
     """
 
@@ -629,7 +628,7 @@ class MinitaurBulletEnv(gym.Env):
         """Raises ValueError when an action component is outside ±1.01, as the original does."""
         action = 1.0 * np.asarray(action)  # integers become floats, float32 stays float32
         if not (np.abs(action) <= 1.01).all():
-            raise ValueError(f"action {action} is outside [-1, 1]")
+            raise ValueError(f"action {action} is outside [-1.01, 1.01]")
         command = self._motor_angles(action)
         for _ in range(self.SUBSTEPS):
             self._substep(command)
@@ -683,8 +682,8 @@ class MinitaurBulletEnv(gym.Env):
         return np.concatenate((self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32)
 
     def privileged_observation(self):
-        """What the observation lacks, (7,) float32: the base's velocity in m/s and angular velocity in rad/s, both in
-        its own frame (forwards, to its left, up), and its height in m."""
+        """What the observation lacks, (7,) float32: the base's velocity in m/s, its angular velocity in rad/s, both in
+        its own frame (forwards, left, up), and its height in m."""
         velocity, angular_velocity = self.simulator.getBaseVelocity(self.robot)
         rotation = np.reshape(self.simulator.getMatrixFromQuaternion(self.orientation), (3, 3))
         return np.concatenate((velocity @ rotation, angular_velocity @ rotation, self.position[2:]), dtype=np.float32)

@@ -96,8 +96,9 @@ def print_ablation(base, step, more):
 
 
 def print_dqn_ablation(base):
-    """How many seeds of `base` and of the runs without a choice reach 200 early and stay there, from 10 000 updates on."""
-    print(f"\n### {base}, without one choice\n\n| without | seeds | 200 by 5000 | median first 200 | stay ≥ 195 | worst |")
+    """How many seeds of `base` and of the runs without a choice reach 200 early, and stay there from 10 000 on."""
+    columns = "without | seeds | 200 by 5000 | median first 200 | stay ≥ 195 | worst"
+    print(f"\n### {base}, without one choice\n\n| {columns} |")
     print(f"|{' --- |' * 6}")
     names = sorted(path.name for path in RESULTS.glob(f"{base}_without_*"))
     for name in (base, *names, f"{base}_tutorial"):

@@ -191,7 +191,7 @@ def dqn_candidates():
 
 def main():
     common.keep_freed_memory()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {torch.__version__}")
+    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch", torch.__version__)
     for title, candidates in (
         ("Minitaur, one step", environment_candidates()),
         ("SAC update, batch 256", update_candidates()),

@@ -73,11 +73,10 @@ def test_targets_by_hand():
     assert targets.tolist() == [1 + 0.5 * 20, 1.0, 2 + 0.5 * 8]
 
 
-def test_terminated_and_truncated_give_different_targets():
-    """One last step of an episode, stored once as truncated and once as terminated."""
+def test_only_a_terminated_step_is_worth_no_more_than_its_reward():
     buffer = ReplayBuffer(2, 4, CPU)
     last = np.ones((2, 4), np.float32)
-    buffer.add(last, np.array([0, 1]), np.ones(2), np.array([False, True]), np.array([True, False]), 2 * last)
+    buffer.add(last, np.array([0, 1]), np.ones(2), np.array([False, True]), 2 * last)
     _, _, rewards, terminated, _ = buffer.rows.split(buffer.sizes, dim=1)
     targets = dqn_cartpole.td_targets(rewards[:, 0], terminated[:, 0], torch.tensor([[50.0, 30.0]] * 2), gamma=0.9)
     assert targets.tolist() == pytest.approx([46.0, 1.0])
@@ -102,7 +101,7 @@ def test_advantage_learning_pushes_values_apart():
 
 
 def test_scaling_maps_bounds_to_one():
-    """From [2, 6] and [-4, 4]; without bounds, with those that float32 cannot subtract, or without width: as they are."""
+    """From [2, 6] and [-4, 4]; without bounds or width, or with those that float32 cannot subtract: as they are."""
     huge = np.finfo(np.float32).max
     low, high = np.float32([[2, -4], [-np.inf, 0], [-huge, 5]]), np.float32([[6, 4], [np.inf, np.inf], [huge, 5]])
     scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(low, high))
@@ -143,7 +142,7 @@ def test_buffer_overwrites_the_oldest():
     buffer = ReplayBuffer(5, 2, CPU)
     for i in range(7):
         value = np.full((1, 2), i, np.float32)
-        buffer.add(value, np.array([i % 2]), np.array([10.0 * i]), np.array([i == 4]), np.array([False]), value + 0.5)
+        buffer.add(value, np.array([i % 2]), np.array([10.0 * i]), np.array([i == 4]), value + 0.5)
     assert (buffer.size, buffer.position) == (5, 2)
     observations, actions, rewards, terminated, next_observations = buffer.sample(1000)
     assert sorted(set(rewards.tolist())) == [20, 30, 40, 50, 60]
@@ -156,7 +155,7 @@ def test_several_environments_fill_the_buffer_across_its_end():
     buffer = ReplayBuffer(4, 1, CPU)
     for i in range(2):
         column = np.arange(3.0) + 3 * i
-        buffer.add(column[:, None], np.zeros(3), column, np.zeros(3), np.zeros(3), column[:, None])
+        buffer.add(column[:, None], np.zeros(3), column, np.zeros(3), column[:, None])
     assert buffer.rows[:, 0].tolist() == [4, 5, 2, 3]
     assert (buffer.size, buffer.position) == (4, 2)
 

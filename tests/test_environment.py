@@ -430,7 +430,7 @@ keep.itself = keep
 
 
 def test_other_tasks_need_no_pybullet(tmp_path):
-    code = f"""
+    code = """
 import sys
 
 class Block:

@@ -186,10 +186,10 @@ CPU = torch.device("cpu")
 
 def numbered(first, count):
     """Steps of one environment (2 observations, 1 action) whose numbers tell where they belong: 0 to 3 are an episode
-    that ends, 4 to 6 one that its time limit ends, 7 the beginning of a third."""
+    that ends, 4 and more are of the next."""
     for n in np.arange(first, first + count, dtype=np.float32)[:, None]:
         observations, next_observations = np.stack((n, n + 0.1), 1), np.stack((n + 0.4, n), 1)
-        yield observations, n[:, None] + 0.2, 10**n, n == 3, n == 6, next_observations
+        yield observations, n[:, None] + 0.2, 10**n, n == 3, next_observations
 
 
 def filled(buffer, first, count):
@@ -208,7 +208,6 @@ def test_replay_buffer_keeps_what_each_environment_did():
     torch.testing.assert_close(actions, n + 0.2)
     torch.testing.assert_close(rewards, 10**n)
     torch.testing.assert_close(next_observations, torch.cat((n + 0.4, n), dim=1))
-    # A fall is an end, a time limit is none.
     assert torch.equal(terminated, (n == 3).float())
     assert (buffer.size, buffer.position) == (16, 16)
 
@@ -813,7 +812,8 @@ def assert_one_line(status, stderr):
     assert status == 2 and len(lines) == 1 and lines[0].startswith("error: "), stderr
 
 
-OUT_OF_RANGE = """--batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
+OUT_OF_RANGE = """
+    --batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
     --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
     --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --device tpu,
     --actor-learning-rate -1, --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01,

@@ -161,16 +161,16 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
     assert "at most 7 steps (--max-episode-steps)" in capsys.readouterr().out
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
     assert common.find_task(Config(env_id="Pendulum-v1"), gym.spaces.Box)[0].max_episode_steps == 200
-    assert (
-        common.find_task(Config(env_id="Pendulum-v1", max_episode_steps=300), gym.spaces.Box)[0].max_episode_steps == 300
-    )
+    longer = Config(env_id="Pendulum-v1", max_episode_steps=300)
+    assert common.find_task(longer, gym.spaces.Box)[0].max_episode_steps == 300
 
 
 def test_a_task_that_wraps_another(monkeypatch):
     """With a function, which gymnasium finds unequal to its like in the spec of an environment made before."""
 
     def make():
-        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, gym.spaces.Box(-99, 99, (3,)))
+        space = gym.spaces.Box(-99, 99, (3,))
+        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, space)
 
     monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
     task, observation_space, _ = common.find_task(Config(env_id="Mine-v0"), gym.spaces.Box)
