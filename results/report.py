@@ -143,6 +143,7 @@ def main():
             print_table(name, goal=15, late=50_000)
     more = {"privileged_critics": "sac_unprivileged", "any of ours": "sac_tutorial"}
     print_ablation("sac_three_step", 20_000, more)
+    print_ablation("sac_20000", 20_000, {})
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
