@@ -63,7 +63,7 @@ class TaskError(Exception):
 
 
 def run_main(main):
-    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status 2 or 1."""
+    """Calls `main`. An error that it expects becomes one line on stderr and the exit status 2 (`InputError`) or 1."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
@@ -72,12 +72,12 @@ def run_main(main):
     threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)
     try:
         main()
-    except (InputError, RunError) as error:
+    except (InputError, RunError, OSError) as error:
         if int(os.environ.get("RANK", 0)) > 0:
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        if isinstance(error, RunError) or dist.is_initialized():
-            os._exit(1 if isinstance(error, RunError) else 2)  # others are not waited for: they may be gone
+        if not isinstance(error, InputError) or dist.is_initialized():
+            os._exit(2 if isinstance(error, InputError) else 1)  # others are not waited for: they may be gone
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -94,7 +94,7 @@ CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=Tr
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d+)?)$")]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d\d?)?)$")]
 Threads = Annotated[int, Field(ge=1, le=1024)]
 
 
@@ -109,6 +109,8 @@ def read_command_line(config_class, description, script):
     (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
     config = tyro.cli(config_class, description=description)
     saved, given = {}, {"tutorial": True}
+    if config.resume is not None and config.evaluate is not None:
+        raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
     if config.resume is not None:
         saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
     elif config.evaluate is not None:
@@ -127,7 +129,7 @@ def read_command_line(config_class, description, script):
 
 def plain_config(config):
     """The config as a dict of numbers, strings and lists, without the paths of this very run."""
-    return to_jsonable_python(config) | {"run_dir": None, "resume": None, "evaluate": None}
+    return to_jsonable_python(vars(config) | {"run_dir": None, "resume": None, "evaluate": None})
 
 
 # Devices, memory and seeds
@@ -244,13 +246,14 @@ def find_task(config, action_space):
             task = dataclasses.replace(gym.registry[env.spec.id], max_episode_steps=limit)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
-    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
     fits = isinstance(actions, action_space)
     if action_space is gym.spaces.Discrete:
         needed, fits = "Discrete from 0", fits and actions.start == 0
     else:
-        needed, fits = "Box of real numbers with finite bounds", fits and actions.shape and actions.dtype.kind == "f"
+        needed = "Box of some dimension, of floats with finite bounds, low < high,"
+        fits = fits and actions.shape and 0 not in actions.shape and actions.dtype.kind == "f"
         if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = (widths.isfinite() & (widths > 0)).all()
@@ -307,13 +310,16 @@ class SeededEpisodes(gym.Wrapper):
     def step(self, action):
         with telling_task_errors():
             observation, reward, terminated, truncated, _ = self.env.step(copy.copy(action))
+            reward = float(reward)
+            if not (math.isfinite(reward) and np.isfinite(np.float32(observation)).all()):
+                raise ValueError(f"it returned the reward {reward} and the observation {observation}: not all finite")
         self.actions.append(np.array(action))
-        self.total += float(reward)
+        self.total += reward
         info = {}
         if terminated or truncated:
             info = {"return": self.total, "length": len(self.actions)}
             self.episode, self.actions = self.episode + 1, []
-        return np.array(observation), float(reward), bool(terminated), bool(truncated), info
+        return np.array(observation), reward, bool(terminated), bool(truncated), info
 
 
 class Environments:
@@ -476,7 +482,7 @@ class Run:
         for name, value in config.items():
             shorter = name == "num_iterations" and value < saved[name]
             if shorter or value != saved[name] and name not in MAY_DIFFER_ON_RESUME:
-                flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "leave it out"
+                flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "use it or leave it out"
                 raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
@@ -484,7 +490,8 @@ class Run:
     def __enter__(self):
         if threading.current_thread() is threading.main_thread():
             for number in STOP_SIGNALS:
-                self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
+                if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
+                    self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
         if self.writes:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
             workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
@@ -496,6 +503,7 @@ class Run:
             for worker in set(multiprocessing.active_children()).difference(others):
                 self.stack.callback(worker.kill)
         keep_freed_memory()
+        self.stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(self.config.num_threads)
         return self
 
@@ -511,7 +519,7 @@ class Run:
         if not (self.path / "checkpoint.pt").exists():
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
-        module = sys.modules[type(self.config).__module__]  # a fork's script has a name of its own
+        module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
         program = Path(getattr(module, "__file__", f"{self.script}.py")).name
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
@@ -538,10 +546,13 @@ class Run:
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
         if saved:
             own = saved["ranks"][self.ranks.rank]
-            agent.load_state_dict(saved["agent"])
+            try:
+                agent.load_state_dict(saved["agent"])
+                buffer.load_state_dict(own["buffer"])
+            except RuntimeError:
+                raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
                 optimizer.load_state_dict(state)
-            buffer.load_state_dict(own["buffer"])
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and "cuda" in own["random"]:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
@@ -560,15 +571,18 @@ class Run:
 
     def _start_files(self):
         try:
+            str(self.path).encode()  # TensorBoard takes no other names
             self.path.mkdir(parents=True, exist_ok=True)
             if self.config.resume is None:
                 if any(self.path.iterdir()):
                     raise FileExistsError(0, "not empty: name a new one, or continue it with --resume")
                 (self.path / "config.json").touch(exist_ok=False)  # fails for the second of two runs started at once
-        except OSError as error:
-            raise InputError(f"--run-dir {self.path} cannot be used: {error.strerror}") from None
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", error)
+            raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
         text = json.dumps(plain_config(self.config), indent=2) + "\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
+        self.claim = (self.path / "config.json").stat().st_ino  # --resume in another process makes a new one
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.path.glob(name):
                 path.unlink()
@@ -608,7 +622,7 @@ class Run:
             writer = csv.DictWriter(text := io.StringIO(), rows[0], lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-            write_atomically(self.path / f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+            self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
 
     def _write_summary(self, table, row):
         for name, value in row.items():
@@ -689,7 +703,12 @@ class Run:
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
-        write_atomically(self.path / name, partial(torch.save, state))
+        self._write(name, partial(torch.save, state))
+
+    def _write(self, name, write):
+        if (self.path / "config.json").stat().st_ino != self.claim:
+            raise RunError(f"another process continues the run in {self.path}: this one stops")
+        write_atomically(self.path / name, write)
 
     def finish(self, step, policy, observation_space):
         """Draws the curve, exports and films the policy, and says where everything lies. What fails costs a line.
@@ -755,10 +774,10 @@ def evaluate_policy(config, script, policy, task, evaluate):
     try:
         policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
     except RuntimeError:
-        raise InputError(f"{config.evaluate} does not fit {config.env_id} and the network of this script") from None
+        raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
     seeds = evaluation_seeds(config)
-    _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None)])
-    print(f"{config.evaluate}: {text}")
+    _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
+    print(f"{config.evaluate}: {text}", flush=True)
     if config.video:
         with or_warn("video", print):
             film([(policy, None, None)], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
@@ -767,7 +786,8 @@ def evaluate_policy(config, script, policy, task, evaluate):
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
-    os.environ.pop("MPLBACKEND", None)  # it draws without one, and a notebook's may not even be installed
+    if "ipykernel" not in sys.modules:  # a command that a notebook started: the notebook's backend may be missing
+        os.environ.pop("MPLBACKEND", None)
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
@@ -808,7 +828,7 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
         return np.asarray(image)
 
     def write(file):
-        rate = env.metadata["render_fps"]
+        rate = env.metadata.get("render_fps", 30)
         skip = math.ceil(rate / max_fps)
         with contextlib.closing(imageio.get_writer(file.name, fps=rate / skip, macro_block_size=2)) as video:
             for policy, weights, caption in parts:

@@ -80,7 +80,7 @@ class Config:
 
     @model_validator(mode="after")
     def _finite_worth(self):
-        if self.value_unit and self.gamma == 1:
+        if self.value_unit and self.gamma == 1 and not self.tutorial:  # --tutorial turns value_unit off later
             raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or --no-value-unit")
         return self
 
@@ -159,7 +159,7 @@ class Policy(nn.Module):
     @torch.inference_mode()
     def act(self, observation):
         """The action for one raw observation: numpy to int."""
-        return int(self(torch.as_tensor(observation, dtype=torch.float32)[None]))
+        return int(self(torch.from_numpy(np.array(observation, np.float32))[None]))
 
 
 # The replay buffer

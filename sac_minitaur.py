@@ -173,7 +173,7 @@ class Policy(nn.Module):
     @torch.inference_mode()
     def act(self, observation):
         """The action for one observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
-        action = self(torch.as_tensor(observation, dtype=torch.float32)[None])[0].numpy()
+        action = self(torch.from_numpy(np.array(observation, np.float32))[None])[0].numpy()
         require_finite(action)
         return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
 

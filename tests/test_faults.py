@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import math
 import multiprocessing
 import os
 import pickle
@@ -124,6 +125,16 @@ def test_checkpoint_of_another_version(script, copy):  # noqa: F811
     assert "no good" in (message := refusal(script, "--resume", copy)) and "gamma" in message
 
 
+def test_resume_and_evaluate_exclude_each_other(script, reference):  # noqa: F811
+    assert "give one of them" in refusal(script, "--resume", reference, "--evaluate", reference / "policy.pt")
+
+
+def test_a_network_that_was_changed_since(script, copy, tmp_path):  # noqa: F811
+    larger = {name: torch.stack((value, value)) for name, value in checkpoint(copy)["agent"].items()}
+    change(copy / "checkpoint.pt", agent=larger)
+    assert_one_line(Process(script, ["--resume", copy], tmp_path / "output"), 2, f"{copy} does not fit")
+
+
 def test_one_script_does_not_continue_the_other(script, reference):  # noqa: F811
     other = SCRIPTS[1 - SCRIPTS.index(script)]
     assert f"is a checkpoint of {script}" in refusal(other, "--resume", reference)
@@ -227,6 +238,18 @@ def test_one_directory_for_two_runs_that_start_at_once(tmp_path):
     assert trained.status == 0 and checkpoint(tmp_path / "run")["step"] == 20
 
 
+def test_a_run_that_is_continued_while_it_runs(script, tmp_path):  # noqa: F811
+    """The older of the two processes stops. Each file is whole."""
+    older = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "older")
+    wait_until((tmp_path / "run" / "eval.csv").exists, 60)
+    newer = Process(script, ["--resume", tmp_path / "run"], tmp_path / "newer")
+    assert_one_line(older, 1, f"another process continues the run in {tmp_path}/run")
+    step = checkpoint(tmp_path / "run")["step"]
+    wait_until(lambda: checkpoint(tmp_path / "run")["step"] > step, 60)
+    newer.kill(signal.SIGINT)
+    assert newer.wait() == 0, newer.stderr
+
+
 def wait_for_the_other(module, path):
     def wait():
         (path / str(os.getpid())).touch()
@@ -275,11 +298,27 @@ def have_no_streams(module):
     sys.stdout = sys.stderr = None
 
 
-@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams])
+def ignore_hangup(module):
+    """As nohup, and then the terminal is closed."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    before_update(module, 50, lambda: os.kill(os.getpid(), signal.SIGHUP))
+
+
+@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams, ignore_hangup])
 def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
     assert (tmp_path / "run" / "best_policy.pt2").exists()
+
+
+@pytest.mark.parametrize("hook", [close_stdout, replace_stderr, have_no_streams])
+def test_evaluates_without_a_console(script, reference, tmp_path, hook):  # noqa: F811
+    assert not finish(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", hook).stderr
+
+
+def test_evaluates_onto_a_full_disk(script, reference, tmp_path):  # noqa: F811
+    arguments = ["--evaluate", reference / "policy.pt"]
+    assert_one_line(Process(script, arguments, tmp_path / "output", print_to_a_full_disk), 1, "No space left")
 
 
 def test_stops_without_a_console(tmp_path):
@@ -482,19 +521,15 @@ def die_filming(module):
 # Losses
 
 
-class NanReward(gym.RewardWrapper):
-    """Gives rewards that are not numbers from its 30th step on."""
-
-    left = 30
-
-    def reward(self, reward):
-        self.left -= 1
-        return reward if self.left > 0 else np.nan
-
-
 def with_nan_rewards(module):
-    make_training_env = module.make_training_env
-    module.make_training_env = lambda *args: NanReward(make_training_env(*args))
+    """From the fourth update on."""
+    sample, calls = module.ReplayBuffer.sample, iter(range(10**9))
+
+    def sample_nan(self, batch_size):
+        batch = sample(self, batch_size)
+        return batch if next(calls) < 3 else (*batch[:2], batch[2] * math.nan, *batch[3:])
+
+    module.ReplayBuffer.sample = sample_nan
 
 
 @pytest.mark.parametrize("log_interval, name", [(1, "loss is nan"), (10**6, "is not finite")])

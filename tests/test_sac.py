@@ -512,6 +512,7 @@ def train(path, **choices):
         method = getattr(SACAgent, name)
 
         def call(self, *arguments):
+            assert torch.get_num_threads() == self.config.num_threads
             calls.append((name, arguments))
             return method(self, *arguments)
 
@@ -522,7 +523,7 @@ def train(path, **choices):
             patch.setattr(SACAgent, name, recorded(name))
         torch.set_num_threads(2)
         returned = sac_minitaur.train(Config(**TINY | {"run_dir": str(path)} | choices))
-    assert returned == path and torch.get_num_threads() == 1
+    assert returned == path and torch.get_num_threads() == 2
     return path, calls
 
 
@@ -815,7 +816,7 @@ def assert_one_line(status, stderr):
 OUT_OF_RANGE = """
     --batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
     --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
-    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --device tpu,
+    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --device tpu, --device cuda:128,
     --actor-learning-rate -1, --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01,
     --target-update-tau -0.1, --averaged-actor-tau 7, --reward-scale-factor inf, --initial-log-alpha nan, --seed -1,
     --seed 9223372036854775808, --batch-size x, --wings 2""".split(",")
@@ -854,6 +855,7 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
         ("--evaluate=", "policy"),
         ("--run-dir full", "not empty"),
         ("--run-dir full/file", "full/file"),
+        ("--run-dir caf\udce9", "cannot be used"),  # bytes that are no UTF-8
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd, tmp_path):
@@ -876,6 +878,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     [
         ("action", gym.spaces.Box(0, 200, (2,), np.uint8)),
         ("action", gym.spaces.Box(-1, np.inf, (2,))),
+        ("action", gym.spaces.Box(-1, 1, (2, 0))),
         ("action", gym.spaces.Box(np.float32([0, -1]), np.float32([0, 1]))),
         ("action", gym.spaces.Box(np.float32(-3e38), np.float32(3e38), (2,))),  # its range is not finite in float32
         ("action", gym.spaces.Box(-1e39, 1e39, (2,), np.float64)),

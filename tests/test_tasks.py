@@ -1,5 +1,7 @@
 """Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
 
+import os
+import signal
 import subprocess
 import sys
 from concurrent.futures.process import BrokenProcessPool
@@ -179,6 +181,27 @@ def test_a_task_that_wraps_another(monkeypatch):
         assert env.observation_space == observation_space
 
 
+@pytest.mark.parametrize("layout", [lambda array: array[::-1], lambda array: array.astype(">f4"), np.longdouble, list])
+def test_observations_of_every_layout(layout, monkeypatch, tmp_path):
+    monkeypatch.setattr(Echo, "_observation", lambda self: layout(self.state.copy()))
+    path, _ = train(tmp_path / "run", **SHORT, **IDS)
+    assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 4
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["reward", "observation"])
+def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_path):
+    step = Echo.step
+
+    def bad_step(self, action):
+        observation, reward, *more = step(self, action)
+        return (observation, value, *more) if where == "reward" else (observation * value, reward, *more)
+
+    monkeypatch.setattr(Echo, "step", bad_step)
+    with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{value}.*not all finite"):
+        train(tmp_path / "run", **SHORT, **IDS)
+
+
 @pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7)])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
 def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path):
@@ -196,6 +219,16 @@ def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypat
     monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", lambda: [].pop()))
     with pytest.raises(IndexError):
         main(monkeypatch, "--env-id", "Mine-v0")
+
+
+def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
+    """A notebook's kernel draws with its own backend afterwards."""
+    monkeypatch.setitem(sys.modules, "ipykernel", None)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    handler = signal.getsignal(signal.SIGINT)
+    path, _ = train(tmp_path / "run", **SHORT, **IDS)
+    assert signal.getsignal(signal.SIGINT) == handler and os.environ["MPLBACKEND"] == "agg"
+    assert (path / "learning_curve.png").exists()
 
 
 def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
