@@ -63,7 +63,7 @@ class TaskError(Exception):
 
 
 def run_main(main):
-    """Calls `main`. An error that it expects becomes one line on stderr and the exit status 2 (`InputError`) or 1."""
+    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status 2 or 1."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
@@ -72,12 +72,12 @@ def run_main(main):
     threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)
     try:
         main()
-    except (InputError, RunError, OSError) as error:
+    except (InputError, RunError) as error:
         if int(os.environ.get("RANK", 0)) > 0:
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        if not isinstance(error, InputError) or dist.is_initialized():
-            os._exit(2 if isinstance(error, InputError) else 1)  # others are not waited for: they may be gone
+        if isinstance(error, RunError) or dist.is_initialized():
+            os._exit(1 if isinstance(error, RunError) else 2)  # others are not waited for: they may be gone
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -777,7 +777,10 @@ def evaluate_policy(config, script, policy, task, evaluate):
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
     seeds = evaluation_seeds(config)
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
-    print(f"{config.evaluate}: {text}", flush=True)
+    try:
+        print(f"{config.evaluate}: {text}", flush=True)
+    except OSError as error:  # a full disk, or a reader that is gone
+        raise RunError(first_line(error)) from None
     if config.video:
         with or_warn("video", print):
             film([(policy, None, None)], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))

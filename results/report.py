@@ -16,7 +16,7 @@ FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_log_alpha_-2": "ours", "sac_three_step": "ours until b02bd46"},
+        {"sac_minitaur": "ours", "sac_three_step": "ours until b02bd46"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "dqn_cartpole": (

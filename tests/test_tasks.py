@@ -216,9 +216,10 @@ def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypat
     (tmp_path / "broken_module.py").write_text("1 / 0")
     with pytest.raises(ZeroDivisionError):
         main(monkeypatch, "--env-id", "broken_module:Task-v0")
-    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", lambda: [].pop()))
-    with pytest.raises(IndexError):
-        main(monkeypatch, "--env-id", "Mine-v0")
+    for make, error in ((lambda: [].pop(), IndexError), (lambda: open(tmp_path / "map"), FileNotFoundError)):
+        monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
+        with pytest.raises(error):
+            main(monkeypatch, "--env-id", "Mine-v0")
 
 
 def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
