@@ -394,7 +394,7 @@ def write_atomically(path, write):
 
     Raises OSError, leaving the old file whole, when the disk is full or not writable.
     """
-    temporary = path.with_name(f".tmp-{path.name}")
+    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
     try:
         with open(temporary, "wb") as file:
             write(file)
@@ -482,7 +482,7 @@ class Run:
         for name, value in config.items():
             shorter = name == "num_iterations" and value < saved[name]
             if shorter or value != saved[name] and name not in MAY_DIFFER_ON_RESUME:
-                flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "use it or leave it out"
+                flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "leave it out"
                 raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
@@ -706,9 +706,12 @@ class Run:
         self._write(name, partial(torch.save, state))
 
     def _write(self, name, write):
-        if (self.path / "config.json").stat().st_ino != self.claim:
-            raise RunError(f"another process continues the run in {self.path}: this one stops")
-        write_atomically(self.path / name, write)
+        try:
+            if (self.path / "config.json").stat().st_ino != self.claim:
+                raise FileNotFoundError
+            write_atomically(self.path / name, write)
+        except FileNotFoundError:
+            raise RunError(f"another process continues the run in {self.path}, or it was removed") from None
 
     def finish(self, step, policy, observation_space):
         """Draws the curve, exports and films the policy, and says where everything lies. What fails costs a line.
