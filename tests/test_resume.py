@@ -319,7 +319,7 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
         elif isinstance(value, bool):
             changed = not value
         else:
-            changed = others[field] if field in others else value + 1 if isinstance(value, int) else value / 2
+            changed = others[field] if field in others else value + 1 if isinstance(value, int) else value / 2 or 0.5
         continued = dataclasses.replace(config, **{field: changed})
         if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads"):
             common.Run(continued, script, None, None)
