@@ -11,18 +11,16 @@ from statistics import median
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).resolve().parent
-# File name → title, the task's threshold, our experiments (directory → label), the tutorials' runs.
+# Directory of our runs, and name of the figure → title, the task's threshold, the tutorials' runs.
 FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
-        {"sac_minitaur": "ours", "sac_three_step": "ours until b02bd46"},
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
-        {"dqn_cartpole": "ours"},
         ("dqn_cartpole_tf2.6", "dqn_cartpole_tf2.11"),
     ),
 }
@@ -110,18 +108,15 @@ def print_dqn_ablation(base):
         print(f"| {label} | {len(curves)} | {early} | {number(median(first), 0)} | {stay} | {min(worst):.1f} |")
 
 
-def draw(name, title, threshold, ours, published):
+def draw(name, title, threshold, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    for color, (experiment, label) in zip(("C0", "C2"), ours.items()):
-        curves = runs(experiment)
-        at = [returns_by_step(rows) for rows in curves.values()]
-        for returns in at:
-            axes.plot(list(returns), list(returns.values()), color=color, linewidth=0.7, alpha=0.6)
-        steps = sorted(set.intersection(*map(set, at)))
-        middle = [median(returns[step] for returns in at) for step in steps]
-        label += f", median of {len(curves)} seeds (each thin)"
-        axes.plot(steps, middle, color=color, linewidth=2.5, label=label)
+    at = [returns_by_step(rows) for rows in runs(name).values()]
+    for returns in at:
+        axes.plot(list(returns), list(returns.values()), color="C0", linewidth=0.7, alpha=0.6)
+    steps = sorted(set.intersection(*map(set, at)))
+    middle = [median(returns[step] for returns in at) for step in steps]
+    axes.plot(steps, middle, color="C0", linewidth=2.5, label=f"ours, median of {len(at)} seeds (each thin)")
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
         label = f"tutorial, {run.rpartition('_')[2]}"
