@@ -107,20 +107,20 @@ def with_tutorial_values(given, tutorial):
 def read_command_line(config_class, description, script):
     """The config that the command line asks for. Its defaults are those of `config_class`, of the tutorial
     (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
-    config = tyro.cli(config_class, description=description)
-    saved, given = {}, {"tutorial": True}
+    default = config_class(tutorial="--tutorial" in sys.argv)
+    config = tyro.cli(config_class, description=description, default=default)
     if config.resume is not None and config.evaluate is not None:
         raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
     if config.resume is not None:
         saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
     elif config.evaluate is not None:
         saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
-    elif not config.tutorial:
-        return config  # its defaults are those already
-    if saved and (others := vars(config).keys() ^ saved["config"].keys()):
+    else:
+        return config
+    if others := vars(config).keys() ^ saved["config"].keys():
         raise InputError(f"{[*given.values()][0]} is of another version of this script: it differs in {min(others)}")
     try:
-        default = config_class(**saved.get("config", {}) | given)
+        default = config_class(**saved["config"] | given)
     except ValueError as error:
         what = " ".join(str(error).split())
         raise InputError(f"{[*given.values()][0]} has a config that is no good: {what}") from None
@@ -585,7 +585,7 @@ class Run:
         self.claim = (self.path / "config.json").stat().st_ino  # --resume in another process makes a new one
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.path.glob(name):
-                path.unlink()
+                path.unlink(missing_ok=True)  # the run may still go on in another process
         from torch.utils.tensorboard import SummaryWriter  # takes a second
 
         self.summary_writer = SummaryWriter(self.path)

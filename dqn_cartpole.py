@@ -80,7 +80,7 @@ class Config:
 
     @model_validator(mode="after")
     def _finite_worth(self):
-        if self.value_unit and self.gamma == 1 and not self.tutorial:  # --tutorial turns value_unit off later
+        if self.value_unit and self.gamma == 1:
             raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or --no-value-unit")
         return self
 

@@ -326,7 +326,8 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
         else:
             with pytest.raises(common.InputError, match=f"^--{field.replace('_', '-')} .*: leave it out$"):
                 common.Run(continued, script, None, None)
-    with pytest.raises(common.InputError, match="--num-iterations 299 differs from the 300 of the run to resume"):
+    message = "--num-iterations 299 differs from the 300 of the run to resume: raise it"
+    with pytest.raises(common.InputError, match=message):
         common.Run(dataclasses.replace(config, num_iterations=299), script, None, None)
 
 
