@@ -25,7 +25,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import NonNegativeFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, PositiveInt, StrictBool, model_validator
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -59,7 +59,7 @@ class Config:
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): the part of action_gap that is taken off a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
-    tutorial: bool = False  # set every value marked "ours" back to the tutorial's; other flags override it
+    tutorial: StrictBool = False  # set every value marked "ours" back to the tutorial's; other flags override it
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps

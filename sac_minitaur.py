@@ -26,7 +26,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import NonNegativeFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, PositiveInt, StrictBool, model_validator
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -65,7 +65,7 @@ class Config:
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
     critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
-    tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
+    tutorial: StrictBool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps

@@ -495,6 +495,8 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     assert (config.learning_rate_decay, config.target_update_tau, config.gamma) == (None, 1.0, 0.9)
     assert (config.value_unit, config.advantage_learning, config.observation_scaling) == (False, 0.0, False)
     assert Config(tutorial=True).gamma == 1.0
+    with pytest.raises(ValueError, match="tutorial"):
+        Config(tutorial="no")
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "1"])
     assert common.read_command_line(Config, "", "dqn_cartpole") == Config(tutorial=True)
 

@@ -400,6 +400,8 @@ def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 12
     assert Config(tutorial=True) == Config(**TUTORIALS, tutorial=True)
     assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
+    with pytest.raises(ValueError, match="tutorial"):
+        Config(tutorial="no")  # not True, but not False either
 
 
 def test_flags_beside_tutorial_still_count(monkeypatch):
