@@ -139,6 +139,7 @@ def main():
     more = {"privileged_critics": "sac_unprivileged", "any of ours": "sac_tutorial"}
     print_ablation("sac_three_step", 20_000, more)
     print_ablation("sac_20000", 20_000, {})
+    print_ablation("sac_unaveraged", 20_000, {})
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
