@@ -114,7 +114,7 @@ def read_command_line(config_class, description, script):
     if config.resume is not None:
         saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
     elif config.evaluate is not None:
-        saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate}
+        saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate, "video": True}
     else:
         return config
     if others := vars(config).keys() ^ saved["config"].keys():

@@ -109,7 +109,7 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
     env_id = register(dtype=dtype, low=low, high=high)
     path, _ = train(tmp_path / "run", **SHORT, env_id=env_id)
     capsys.readouterr()
-    assert main(monkeypatch, "--evaluate", path / "policy.pt", "--video") == 0
+    assert main(monkeypatch, "--evaluate", path / "policy.pt") == 0  # of a run without videos: this one wants a film
     output = capsys.readouterr().out
     assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
     assert "warning: no video (Echo.__init__() got an unexpected keyword argument 'render_mode'" in output
