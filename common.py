@@ -111,19 +111,20 @@ def read_command_line(config_class, description, script):
     config = tyro.cli(config_class, description=description, default=default)
     if config.resume is not None and config.evaluate is not None:
         raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
-    if config.resume is not None:
-        saved, given = read_file(config.resume / "checkpoint.pt", "checkpoint", script), {"resume": config.resume}
-    elif config.evaluate is not None:
-        saved, given = read_file(config.evaluate, "policy", script), {"evaluate": config.evaluate, "video": True}
-    else:
+    source = config.resume or config.evaluate
+    if source is None:
         return config
+    if config.resume is not None:
+        saved, given = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
+    else:
+        saved, given = read_file(source, "policy", script), {"evaluate": source, "video": True}
     if others := vars(config).keys() ^ saved["config"].keys():
-        raise InputError(f"{[*given.values()][0]} is of another version of this script: it differs in {min(others)}")
+        raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
     try:
         default = config_class(**saved["config"] | given)
     except ValueError as error:
         what = " ".join(str(error).split())
-        raise InputError(f"{[*given.values()][0]} has a config that is no good: {what}") from None
+        raise InputError(f"{source} has a config that is no good: {what}") from None
     return tyro.cli(config_class, description=description, default=default)
 
 

@@ -311,8 +311,9 @@ def test_trains_on_without_a_console(tmp_path, hook):
     assert (tmp_path / "run" / "best_policy.pt2").exists()
 
 
-def test_evaluates_without_a_console(script, reference, tmp_path):  # noqa: F811
-    finish(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", have_no_streams)
+@pytest.mark.parametrize("hook", [close_stdout, replace_stderr, have_no_streams])
+def test_evaluates_without_a_console(script, reference, tmp_path, hook):  # noqa: F811
+    assert not finish(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", hook).stderr
 
 
 def test_evaluates_onto_a_full_disk(script, reference, tmp_path):  # noqa: F811

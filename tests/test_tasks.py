@@ -181,14 +181,15 @@ def test_a_task_that_wraps_another(monkeypatch):
         assert env.observation_space == observation_space
 
 
-@pytest.mark.parametrize("layout", [lambda array: array[::-1], lambda array: array.astype(">f4"), np.longdouble])
+@pytest.mark.parametrize("layout", [lambda array: array[::-1], lambda array: array.astype(">f4"), np.longdouble, list])
 def test_observations_of_every_layout(layout, monkeypatch, tmp_path):
     monkeypatch.setattr(Echo, "_observation", lambda self: layout(self.state.copy()))
     path, _ = train(tmp_path / "run", **SHORT, **IDS)
     assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 4
 
 
-@pytest.mark.parametrize("where, value", [("reward", np.nan), ("observation", np.inf)])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["reward", "observation"])
 def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_path):
     step = Echo.step
 
