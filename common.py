@@ -4,6 +4,7 @@ The command line, devices and processes, tasks and their workers, and the run di
 policies, curve and videos. No network, loss or replay buffer is defined here.
 """
 
+import argparse
 import contextlib
 import copy
 import csv
@@ -96,6 +97,7 @@ Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d\d?)?)$")]
 Threads = Annotated[int, Field(ge=1, le=1024)]
+Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
 def with_tutorial_values(given, tutorial):
@@ -107,24 +109,25 @@ def with_tutorial_values(given, tutorial):
 def read_command_line(config_class, description, script):
     """The config that the command line asks for. Its defaults are those of `config_class`, of the tutorial
     (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
-    default = config_class(tutorial="--tutorial" in sys.argv)
-    config = tyro.cli(config_class, description=description, default=default)
-    if config.resume is not None and config.evaluate is not None:
+    sources = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in ("--resume", "--evaluate"):
+        sources.add_argument(flag, type=Path, nargs="?")
+    given, _ = sources.parse_known_args()
+    if given.resume and given.evaluate:
         raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
-    source = config.resume or config.evaluate
-    if source is None:
-        return config
-    if config.resume is not None:
-        saved, given = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
-    else:
-        saved, given = read_file(source, "policy", script), {"evaluate": source, "video": True}
-    if others := vars(config).keys() ^ saved["config"].keys():
-        raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
-    try:
-        default = config_class(**saved["config"] | given)
-    except ValueError as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{source} has a config that is no good: {what}") from None
+    default = config_class(tutorial="--tutorial" in sys.argv)
+    if source := given.resume or given.evaluate:
+        if given.resume:
+            saved, more = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
+        else:
+            saved, more = read_file(source, "policy", script), {"evaluate": source, "video": True}
+        if others := vars(default).keys() ^ saved["config"].keys():
+            raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
+        try:
+            default = config_class(**saved["config"] | more)
+        except ValueError as error:
+            what = " ".join(str(error).split())
+            raise InputError(f"{source} has a config that is no good: {what}") from None
     return tyro.cli(config_class, description=description, default=default)
 
 

@@ -58,7 +58,7 @@ class Config:
     value_unit: bool = True  # ours (theirs: no): give Q the unit of the worth of an endless episode
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): the part of action_gap that is taken off a target
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
-    layers: tuple[PositiveInt, ...] = (100, 50)  # hidden units of the Q-network
+    layers: common.Layers = (100, 50)  # hidden units of the Q-network
     tutorial: StrictBool = False  # set every value marked "ours" back to the tutorial's; other flags override it
 
     seed: common.Seed = 0  # source of all randomness

@@ -63,8 +63,8 @@ class Config:
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each number of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
-    actor_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of the actor
-    critic_layers: tuple[PositiveInt, ...] = (256, 256)  # hidden units of each critic
+    actor_layers: common.Layers = (256, 256)  # hidden units of the actor
+    critic_layers: common.Layers = (256, 256)  # hidden units of each critic
     tutorial: StrictBool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
     seed: common.Seed = 0  # source of all randomness

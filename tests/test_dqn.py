@@ -466,7 +466,7 @@ def test_bad_input_from_the_shell():
     [
         ("num_iterations", (0, -5)),
         ("num_envs", (0,)),
-        ("layers", ((-4,),)),
+        ("layers", ((-4,), (10**9,))),
         ("learning_rate", (-1, math.nan)),
         ("learning_rate_decay", (0,)),
         ("epsilon", (3,)),
@@ -499,6 +499,15 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
         Config(tutorial="no")
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "1"])
     assert common.read_command_line(Config, "", "dqn_cartpole") == Config(tutorial=True)
+
+
+def test_a_flag_is_judged_beside_the_saved_values(monkeypatch, tmp_path):
+    """Not beside the defaults: γ = 1 goes with no value unit."""
+    saved = {"kind": "policy", "script": "dqn_cartpole", "format": common.FILE_FORMAT}
+    torch.save(saved | {"config": common.plain_config(Config(tutorial=True))}, path := tmp_path / "policy.pt")
+    for flags in (["--evaluate", str(path), "--gamma", "1"], ["--gamma=1", f"--evaluate={path}"]):
+        monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", *flags])
+        assert common.read_command_line(Config, "", "dqn_cartpole") == Config(tutorial=True, evaluate=path)
 
 
 def test_only_cartpoles_own_version_warning_is_silenced():

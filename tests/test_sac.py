@@ -818,10 +818,11 @@ def assert_one_line(status, stderr):
 OUT_OF_RANGE = """
     --batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
     --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
-    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0, --device tpu,
-    --device cuda:128, --actor-learning-rate -1, --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1,
-    --gamma 1.01, --target-update-tau -0.1, --averaged-actor-tau 7, --reward-scale-factor inf,
-    --initial-log-alpha nan, --seed -1, --seed 9223372036854775808, --batch-size x, --wings 2""".split(",")
+    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0,
+    --actor-layers 1000000000, --device tpu, --device cuda:128, --actor-learning-rate -1,
+    --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01, --target-update-tau -0.1,
+    --averaged-actor-tau 7, --reward-scale-factor inf, --initial-log-alpha nan, --seed -1,
+    --seed 9223372036854775808, --batch-size x, --wings 2""".split(",")
 
 
 @pytest.mark.parametrize("arguments", OUT_OF_RANGE)
@@ -834,7 +835,7 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
     assert len(output.err.splitlines()) < 20
     if flag not in ("--wings", "--batch-size"):
         with pytest.raises(ValidationError, match=flag[2:].replace("-", "_")):
-            Config(**{flag[2:].replace("-", "_"): [0] if "layers" in flag else value})
+            Config(**{flag[2:].replace("-", "_"): [int(value)] if "layers" in flag else value})
 
 
 @pytest.mark.parametrize(
