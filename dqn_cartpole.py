@@ -7,9 +7,10 @@
     python dqn_cartpole.py --tutorial                         # the tutorial's own choices, which are less stable
     torchrun --nproc-per-node 2 dqn_cartpole.py               # two processes, one agent
 
-The Q-network estimates Q(s, a), the discounted sum of the rewards after action a in state s. Each update moves Q(s, a)
-towards r + γ max Q(s', ·). A slow copy of it, the target network, computes that maximum, so that the goal moves slowly.
-The policy takes the action of the largest Q. While it collects data, some actions are random: so it explores.
+The Q-network estimates Q(s, a), the sum of the rewards from action a in state s on. Each later reward counts γ times
+as much as the one before. Each update moves Q(s, a) towards r + γ max Q(s', ·): s' is the next state, r the reward. A
+slow copy of the Q-network, the target network, computes that maximum, so that the goal moves slowly. The policy takes
+the action of the largest Q. While it collects data, some actions are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
@@ -55,8 +56,8 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): give Q the unit of the worth of an endless episode
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): the part of action_gap that is taken off a target
+    value_unit: bool = True  # ours (theirs: no): scale Q so that an output of 0 is the worth of an endless episode
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): how much of max Q(s, ·) − Q(s, a) a target loses
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
     tutorial: StrictBool = False  # set every value marked "ours" back to the tutorial's; other flags override it
@@ -214,7 +215,7 @@ def td_targets(rewards, terminated, next_q, gamma):
     return rewards + gamma * (1 - terminated) * next_q.amax(1)
 
 
-def action_gap(q, actions):
+def gap_to_best(q, actions):
     """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,). 0 for the best action (arXiv:1512.04860)."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
@@ -265,7 +266,7 @@ class DQNAgent(nn.Module):
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
     def q_values(self, network, observations):
-        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). Offset and scale are ours."""
+        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). Offset and scale keep the order of actions."""
         return self.value_offset + self.value_scale * network(observations)
 
     def update(self, batch, step):
@@ -281,7 +282,7 @@ class DQNAgent(nn.Module):
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
             if config.advantage_learning:  # ours: y − weight × (max Q̄(s, ·) − Q̄(s, a)), so worse actions fall further
-                y -= config.advantage_learning * action_gap(self.q_values(self.target_network, s), a)
+                y -= config.advantage_learning * gap_to_best(self.q_values(self.target_network, s), a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
         loss = F.mse_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
@@ -324,9 +325,9 @@ def make_training_env(task):
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
-    Raises InputError for an unusable config and RunError when the run fails. Saved files stay. A resumed run equals an
-    uninterrupted one: the checkpoint holds the agent, the replay, the random generators, and the seeds and actions of
-    the running episodes. The resumed run plays these again.
+    Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
+    stay. A resumed run equals an uninterrupted one: the checkpoint holds the agent, the replay, the random generators,
+    and the seeds and actions of the running episodes. The resumed run plays these again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:

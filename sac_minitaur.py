@@ -7,9 +7,10 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor draws actions at random; two critics estimate their value Q. The actor learns to make Q + α × entropy large:
-it earns much, yet stays as random as it can, and so it explores. α is tuned until the entropy has a given value. The
-actor uses the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its errors.
+The actor samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
+earns much, yet stays as random as it can, and so it explores. α is tuned until the entropy has a given value. Actor and
+critics learn from the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its
+errors.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
@@ -61,7 +62,7 @@ class Config:
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
     mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each number of an action
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each dimension of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -69,7 +70,7 @@ class Config:
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Threads = 1  # CPU threads of the update: best 1 on one or two cores, about 4 on eight
+    num_threads: common.Threads = 1  # CPU threads of the update: 1 is best on two cores; on eight we expect 4
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
@@ -436,9 +437,9 @@ def make_training_env(task, privileged):
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
-    Raises InputError for an unusable config and RunError when the run fails. Saved files stay. A resumed run equals an
-    uninterrupted one: the checkpoint holds the agent, the replay, the random generators, and the seeds and actions of
-    the running episodes. The resumed run plays these again.
+    Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
+    stay. A resumed run equals an uninterrupted one: the checkpoint holds the agent, the replay, the random generators,
+    and the seeds and actions of the running episodes. The resumed run plays these again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:

@@ -82,8 +82,8 @@ def test_only_a_terminated_step_is_worth_no_more_than_its_reward():
     assert targets.tolist() == pytest.approx([46.0, 1.0])
 
 
-def test_action_gap():
-    gap = dqn_cartpole.action_gap(torch.tensor([[3.0, 1.0, 2.0], [3.0, 1.0, 2.0]]), torch.tensor([0, 1]))
+def test_gap_to_best():
+    gap = dqn_cartpole.gap_to_best(torch.tensor([[3.0, 1.0, 2.0], [3.0, 1.0, 2.0]]), torch.tensor([0, 1]))
     assert gap.tolist() == [0.0, 2.0]
 
 
