@@ -74,14 +74,14 @@ def run_main(main):
     try:
         main()
     except (InputError, RunError) as error:
-        if int(os.environ.get("RANK", 0)) > 0:
+        if os.environ.get("RANK", "0") != "0":
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
         if isinstance(error, RunError) or dist.is_initialized():
             os._exit(1 if isinstance(error, RunError) else 2)  # others are not waited for: they may be gone
         sys.exit(2)
     except KeyboardInterrupt:
-        sys.exit(130)
+        os._exit(130)  # nothing is waited for
 
 
 def first_line(error):
@@ -273,7 +273,7 @@ def telling_task_errors():
         yield
     except RunError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise TaskError(f"the task failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
@@ -305,25 +305,33 @@ class SeededEpisodes(gym.Wrapper):
         replay, self.actions, self.total = self.actions, [], 0.0
         with telling_task_errors():
             observation, _ = self.env.reset(seed=episode_seed(*self.key, self.episode))
+            observation = self._checked(observation)
         for action in replay:
             observation, _, terminated, truncated, _ = self.step(action)
             if terminated or truncated:
                 return self.reset()[0], {"not_repeatable": True}
-        return np.array(observation), {}
+        return observation, {}
 
     def step(self, action):
         with telling_task_errors():
             observation, reward, terminated, truncated, _ = self.env.step(copy.copy(action))
-            reward = float(reward)
-            if not (math.isfinite(reward) and np.isfinite(np.float32(observation)).all()):
-                raise ValueError(f"it returned the reward {reward} and the observation {observation}: not all finite")
+            observation, reward = self._checked(observation, float(reward)), float(reward)
         self.actions.append(np.array(action))
         self.total += reward
         info = {}
         if terminated or truncated:
             info = {"return": self.total, "length": len(self.actions)}
             self.episode, self.actions = self.episode + 1, []
-        return np.array(observation), reward, bool(terminated), bool(truncated), info
+        return observation, reward, bool(terminated), bool(truncated), info
+
+    def _checked(self, observation, reward=0.0):
+        """A copy of the observation, if it has the shape of its space and is finite in float32, as is the reward."""
+        observation, shape = np.array(observation), self.observation_space.shape
+        if observation.shape != shape:
+            raise ValueError(f"it returned an observation of shape {observation.shape}, but its space has {shape}")
+        if not (np.isfinite(np.float32(reward)) and np.isfinite(np.float32(observation)).all()):
+            raise ValueError(f"it returned the reward {reward} and the observation {observation}: not all finite")
+        return observation
 
 
 class Environments:
@@ -422,10 +430,9 @@ def read_file(path, kind, script):
                 raise ValueError(f"{damaged} is damaged")
         state = torch.load(path, map_location="cpu", weights_only=True)
         found = "a {kind} of {script}, format {format}".format_map(state)
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist: --resume takes a run's directory, --evaluate its policy.pt") from None
-    except Exception as error:  # whatever a damaged or hostile file provokes
-        raise InputError(f"{path} is not a whole {kind} of this project ({first_line(error)})") from None
+    except Exception as error:  # whatever a missing, damaged or hostile file provokes
+        what = f"{path} is not a whole {kind} of this project ({getattr(error, 'strerror', None) or first_line(error)})"
+        raise InputError(f"{what}: --resume takes a run's directory, --evaluate its policy.pt") from None
     if found != (needed := f"a {kind} of {script}, format {FILE_FORMAT}"):
         raise InputError(f"{path} is {found}; needed: {needed}")
     return state
@@ -529,7 +536,7 @@ class Run:
 
     def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
-            os._exit(130)  # the workers notice and follow
+            raise KeyboardInterrupt
         self.stopping = True
         with contextlib.suppress(Exception):  # no console
             os.write(sys.stderr.fileno(), b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
@@ -574,6 +581,8 @@ class Run:
         return self.saved_step, saved.get("env_steps", 0)
 
     def _start_files(self):
+        from torch.utils.tensorboard import SummaryWriter  # takes a second
+
         try:
             str(self.path).encode()  # TensorBoard takes no other names
             self.path.mkdir(parents=True, exist_ok=True)
@@ -585,13 +594,15 @@ class Run:
             why = getattr(error, "strerror", error)
             raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
         text = json.dumps(plain_config(self.config), indent=2) + "\n"
-        write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
-        self.claim = (self.path / "config.json").stat().st_ino  # --resume in another process makes a new one
+
+        def write(file):
+            file.write(text.encode())
+            self.claim = os.fstat(file.fileno()).st_ino  # --resume in another process makes a new one
+
+        write_atomically(self.path / "config.json", write)
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.path.glob(name):
                 path.unlink(missing_ok=True)  # the run may still go on in another process
-        from torch.utils.tensorboard import SummaryWriter  # takes a second
-
         self.summary_writer = SummaryWriter(self.path)
         self.stack.push(lambda kind, *_: kind is not None and issubclass(kind, OSError))  # the same full disk again
         self.stack.callback(self.summary_writer.close)
@@ -687,7 +698,8 @@ class Run:
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
     def _film(self, parts, name, *more):
-        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], self.path / name, *more)])[0]
+        path = (self.path / name).absolute()  # a task may change the worker's directory
+        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], path, *more)])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
@@ -734,18 +746,21 @@ class Run:
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
             learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]
-            films["learning.mp4"] = self._film(learning, "learning.mp4", 4, 25)
-            films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
-            films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
+            with or_warn("films", self.print):
+                films["learning.mp4"] = self._film(learning, "learning.mp4", 4, 25)
+                films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
+                films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
         with or_warn("exported policy", self.print):
             export_policy(self.path / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.found["best"][1])
             export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
             with or_warn(name, self.print):
-                while not self.stopping and not recording.done():
+                while not recording.done():
+                    if self.stopping:
+                        return self.print(f"stopped while filming; {self._how_to_continue()}")
                     time.sleep(0.1)
-                recording.result(timeout=0)
+                recording.result()
         files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
         self.print(f"finished; {self.path} holds {files}")
 
@@ -838,9 +853,10 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
         return np.asarray(image)
 
     def write(file):
-        rate = env.metadata.get("render_fps", 30)
+        rate = env.metadata.get("render_fps") or 30
         skip = math.ceil(rate / max_fps)
-        with contextlib.closing(imageio.get_writer(file.name, fps=rate / skip, macro_block_size=2)) as video:
+        options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+        with contextlib.closing(imageio.get_writer(file.name, **options)) as video:
             for policy, weights, caption in parts:
                 if weights:
                     policy.load_state_dict(weights)

@@ -275,6 +275,40 @@ def interrupt_twice(module):
     before_call(common.Run, "save", 2, interrupt)
 
 
+def test_second_interrupt_in_a_notebook(script, tmp_path):
+    """It ends the cell and no more."""
+    run = finish(script, flags(script, tmp_path / "run"), tmp_path / "output", interrupt_a_cell_twice)
+    assert run.stdout.splitlines()[-1] == "the kernel lives, with 0 workers"
+
+
+def interrupt_a_cell_twice(module):
+    interrupt_twice(module)
+    main = module.main
+
+    def cell():
+        with pytest.raises(KeyboardInterrupt):
+            main()
+        print(f"the kernel lives, with {len(multiprocessing.active_children())} workers")
+
+    module.main = cell
+
+
+def test_stop_while_filming(script, reference, tmp_path):
+    """The films are made when the run is continued."""
+    shutil.copytree(reference, run := tmp_path / "run")
+    stopped = finish(script, ["--resume", run, "--video"], tmp_path / "stopped", interrupt_a_film)
+    assert "stopped while filming; to continue" in stopped.stdout.splitlines()[-1]
+    assert "warning" not in stopped.stdout and stopped.stderr.startswith("\nstopping:")
+    assert len(stopped.stderr.splitlines()) == 2 and not list(run.glob("[!.]*.mp4"))
+    finish(script, ["--resume", run, "--video"], tmp_path / "continued")
+    assert len(list(run.glob("*.mp4"))) == 3
+
+
+def interrupt_a_film(module):
+    before_call(imageio.core.format.Format.Writer, "append_data", 3, lambda: time.sleep(60))
+    before_call(common, "export_policy", 2, interrupt)  # while the workers film
+
+
 def test_several_seeds_in_processes_of_a_script_of_their_own(script, tmp_path):
     """Each stops with a checkpoint, whether the terminal interrupts them all or one is asked to."""
     run = Process(script, [tmp_path], tmp_path / "output", train_seeds)
@@ -332,7 +366,7 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
 
 
 def test_refusal_at_the_command_line(script, reference, tmp_path):
-    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "does not exist")):
+    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "No such file")):
         run = Process(script, ["--resume", *arguments], tmp_path / word)
         assert run.wait() == 2
         assert run.stderr.count("\n") == 1 and run.stderr.startswith("error: ") and word in run.stderr

@@ -1,6 +1,7 @@
 """Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -188,21 +189,35 @@ def test_observations_of_every_layout(layout, monkeypatch, tmp_path):
     assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 4
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("where", ["reward", "observation"])
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])  # the last is too large for float32
+@pytest.mark.parametrize("where", ["reward", "observation", "first observation"])
 def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_path):
-    step = Echo.step
+    step, reset = Echo.step, Echo.reset
 
     def bad_step(self, action):
         observation, reward, *more = step(self, action)
-        return (observation, value, *more) if where == "reward" else (observation * value, reward, *more)
+        return (observation, value, *more) if where == "reward" else (np.full(2, value), reward, *more)
 
-    monkeypatch.setattr(Echo, "step", bad_step)
-    with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{value}.*not all finite"):
+    if where == "first observation":
+        monkeypatch.setattr(Echo, "reset", lambda self, **more: (np.full(2, value), reset(self, **more)[1]))
+    else:
+        monkeypatch.setattr(Echo, "step", bad_step)
+    message = f"the task failed: it returned the reward .*({re.escape(str(value))}|inf).*not all finite"
+    with pytest.raises(common.TaskError, match=message):
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-@pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7)])
+@pytest.mark.parametrize("wrong", [np.zeros(3), np.float32(0), np.zeros((1, 3))], ids=np.shape)
+@pytest.mark.parametrize("when", [0, 3])
+def test_a_task_that_returns_another_shape(when, wrong, monkeypatch, tmp_path):
+    right = Echo._observation
+    monkeypatch.setattr(Echo, "_observation", lambda self: wrong if self.state[0] == when else right(self))
+    with pytest.raises(common.TaskError, match="it returned an observation of shape .* its space has "):
+        train(tmp_path / "run", **SHORT, **IDS)
+
+
+@pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7), SystemExit])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
 def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path):
     with pytest.raises(common.TaskError) as caught:
