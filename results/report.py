@@ -80,11 +80,11 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_ablation(base, step, more):
-    """Returns after `step` updates of `base`, of the runs without one choice, and of `more`, with the seeds of all."""
+def print_ablation(base, step):
+    """Returns after `step` updates of `base` and of the runs without one choice, with the seeds of all."""
     without = f"{base}_without_"
     names = {path.name.removeprefix(without): path.name for path in sorted(RESULTS.glob(f"{without}*"))}
-    curves = {label: runs(name) for label, name in ({"nothing": base} | names | more).items()}
+    curves = {label: runs(name) for label, name in ({"nothing": base} | names).items()}
     seeds = sorted(set.intersection(*map(set, curves.values())))
     print(f"\n### {base} at {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
     print(f"|{' --- |' * (len(seeds) + 2)}")
@@ -136,10 +136,8 @@ def main():
             print_table(name, goal=-200, late=5_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
-    more = {"privileged_critics": "sac_unprivileged", "any of ours": "sac_tutorial"}
-    print_ablation("sac_three_step", 20_000, more)
-    print_ablation("sac_20000", 20_000, {})
-    print_ablation("sac_unaveraged", 20_000, {})
+    print_ablation("sac_20000", 20_000)
+    print_ablation("sac_unaveraged", 20_000)
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
