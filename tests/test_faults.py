@@ -129,6 +129,12 @@ def test_resume_and_evaluate_exclude_each_other(script, reference):  # noqa: F81
     assert "give one of them" in refusal(script, "--resume", reference, "--evaluate", reference / "policy.pt")
 
 
+def test_a_path_of_another_kind(script, reference):  # noqa: F811
+    saved, exported = reference / "checkpoint.pt", reference / "policy.pt2"
+    for arguments in (["--evaluate", reference], ["--resume", saved], ["--evaluate", exported]):
+        assert "--resume takes a run's directory, --evaluate its policy.pt" in refusal(script, *arguments)
+
+
 def test_a_network_that_was_changed_since(script, copy, tmp_path):  # noqa: F811
     larger = {name: torch.stack((value, value)) for name, value in checkpoint(copy)["agent"].items()}
     change(copy / "checkpoint.pt", agent=larger)
