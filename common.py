@@ -315,7 +315,8 @@ class SeededEpisodes(gym.Wrapper):
     def step(self, action):
         with telling_task_errors():
             observation, reward, terminated, truncated, _ = self.env.step(copy.copy(action))
-            observation, reward = self._checked(observation, float(reward)), float(reward)
+            reward = float(reward)
+            observation = self._checked(observation, reward)
         self.actions.append(np.array(action))
         self.total += reward
         info = {}
@@ -431,8 +432,9 @@ def read_file(path, kind, script):
         state = torch.load(path, map_location="cpu", weights_only=True)
         found = "a {kind} of {script}, format {format}".format_map(state)
     except Exception as error:  # whatever a missing, damaged or hostile file provokes
-        what = f"{path} is not a whole {kind} of this project ({getattr(error, 'strerror', None) or first_line(error)})"
-        raise InputError(f"{what}: --resume takes a run's directory, --evaluate its policy.pt") from None
+        missing = isinstance(error, FileNotFoundError)
+        what = "does not exist" if missing else f"is not a whole {kind} of this project ({first_line(error)})"
+        raise InputError(f"{path} {what}: --resume takes a run's directory, --evaluate its policy.pt") from None
     if found != (needed := f"a {kind} of {script}, format {FILE_FORMAT}"):
         raise InputError(f"{path} is {found}; needed: {needed}")
     return state

@@ -366,7 +366,7 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
 
 
 def test_refusal_at_the_command_line(script, reference, tmp_path):
-    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "No such file")):
+    for arguments, word in (([reference, "--seed", 1], "--seed"), ([tmp_path / "none"], "does not exist")):
         run = Process(script, ["--resume", *arguments], tmp_path / word)
         assert run.wait() == 2
         assert run.stderr.count("\n") == 1 and run.stderr.startswith("error: ") and word in run.stderr

@@ -1,7 +1,6 @@
 """Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -203,8 +202,8 @@ def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_p
         monkeypatch.setattr(Echo, "reset", lambda self, **more: (np.full(2, value), reset(self, **more)[1]))
     else:
         monkeypatch.setattr(Echo, "step", bad_step)
-    message = f"the task failed: it returned the reward .*({re.escape(str(value))}|inf).*not all finite"
-    with pytest.raises(common.TaskError, match=message):
+    shown = r"(1e\+39|inf)" if value == 1e39 else value
+    with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{shown}.*not all finite"):
         train(tmp_path / "run", **SHORT, **IDS)
 
 
