@@ -189,19 +189,22 @@ def evaluation_seeds(config):
 class Ranks:
     """This process among those that torchrun started. Without torchrun it is rank 0 of 1 and talks to nobody."""
 
-    def __init__(self, rank=0, world_size=1):
-        self.rank, self.world_size = rank, world_size
+    def __init__(self, rank=0, world_size=1, local_rank=0):
+        self.rank, self.world_size, self.local_rank = rank, world_size, local_rank
 
     @classmethod
     def join(cls):
-        """Joins the processes that torchrun's environment variables describe. Raises InputError when one is missing."""
+        """Joins the processes that torchrun's environment variables describe. Raises InputError when they are no good."""
         if "RANK" not in os.environ or os.environ.get("WORLD_SIZE") == "1":
             return cls()
-        if missing := {"WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"} - os.environ.keys():
-            raise InputError(f"RANK is set but {min(missing)} is not: start processes with torchrun, or unset RANK")
-        if not dist.is_initialized():
-            dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        return cls(dist.get_rank(), dist.get_world_size())
+        try:
+            local_rank = int(os.environ["LOCAL_RANK"])
+            if not dist.is_initialized():
+                dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        except (KeyError, ValueError, dist.DistError) as error:
+            what = f"RANK is set but the processes cannot join: {first_line(error)}"
+            raise InputError(f"{what}; start them with torchrun, or unset RANK") from None
+        return cls(dist.get_rank(), dist.get_world_size(), local_rank)
 
     def batch_share(self, config):
         """The size of this process's share of a batch. Raises InputError when the shares are not equal, or when the
@@ -471,7 +474,7 @@ class Run:
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
         self.ranks, self.checkpoint = Ranks.join(), {}
         self.writes = self.ranks.rank == 0
-        self.device = select_device(config.device, int(os.environ.get("LOCAL_RANK", 0)))
+        self.device = select_device(config.device, self.ranks.local_rank)
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
         if config.resume is not None:

@@ -437,8 +437,10 @@ def test_evaluations_take_the_cores_they_may_use(script):  # noqa: F811
 def test_processes_that_cannot_train(script, tmp_path):  # noqa: F811
     run = Process(script, [], tmp_path / "pool", train_in_a_pool)
     assert_one_line(run, 2, "use multiprocessing.Process")
-    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "rank", RANK="0", WORLD_SIZE="2", LOCAL_RANK="0")
-    assert_one_line(run, 2, "RANK is set but MASTER_ADDR is not", "torchrun")
+    for rank, wrong in (("0", "MASTER_ADDR"), ("abc", "abc")):
+        variables = dict(RANK=rank, WORLD_SIZE="2", LOCAL_RANK="0")
+        run = Process(script, flags(script, tmp_path / "run"), tmp_path / f"rank{rank}", **variables)
+        assert_one_line(run, 2, "RANK is set but", wrong, "torchrun")
     assert not (tmp_path / "run").exists()
 
 
