@@ -25,6 +25,7 @@ import threading
 import time
 import traceback
 import zipfile
+import zlib
 from collections import deque
 from concurrent import futures
 from datetime import datetime
@@ -77,11 +78,14 @@ def run_main(main):
         if os.environ.get("RANK", "0") != "0":
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        if isinstance(error, RunError) or dist.is_initialized():
-            os._exit(1 if isinstance(error, RunError) else 2)  # others are not waited for: they may be gone
-        sys.exit(2)
+        status = 1 if isinstance(error, RunError) else 2
     except KeyboardInterrupt:
-        os._exit(130)  # nothing is waited for
+        status = 130
+    else:
+        return
+    if dist.is_initialized():
+        os._exit(status)  # the others are not waited for: they may be gone
+    sys.exit(status)
 
 
 def first_line(error):
@@ -121,7 +125,10 @@ def read_command_line(config_class, description, script):
             saved, more = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
         else:
             saved, more = read_file(source, "policy", script), {"evaluate": source, "video": True}
-        if others := vars(default).keys() ^ saved["config"].keys():
+        others = saved["config"].keys() - vars(default).keys()
+        if given.resume:  # a policy may be older than a field that a fork adds
+            others |= vars(default).keys() - saved["config"].keys()
+        if others:
             raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
         try:
             default = config_class(**saved["config"] | more)
@@ -194,7 +201,7 @@ class Ranks:
 
     @classmethod
     def join(cls):
-        """Joins the processes that torchrun's environment variables describe. Raises InputError when they are no good."""
+        """Joins the processes that torchrun's variables describe. Raises InputError when these are no good."""
         if "RANK" not in os.environ or os.environ.get("WORLD_SIZE") == "1":
             return cls()
         try:
@@ -213,7 +220,7 @@ class Ranks:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         own = min(config.initial_collect_steps // self.world_size, config.replay_buffer_capacity)
         if config.batch_size > (stored := own * self.world_size):
-            raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions collected first")
+            raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions stored at first")
         return config.batch_size // self.world_size
 
     def average(self, tensors):
@@ -365,8 +372,8 @@ class Environments:
         run.stack.callback(self.close)
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
         self.observations, infos = self.vector.reset()  # brings each to where its episode stands
-        self.lost = infos.get("_not_repeatable", np.zeros(num_envs, bool))  # where that had to be a new episode
-        self.num_episodes += self.lost
+        self.num_episodes += infos.get("_not_repeatable", 0)  # where that had to be a new episode
+        self.resumed_exactly = saved.get("checksum", self._checksum()) == self._checksum()
 
     def step_async(self, actions):
         """Starts a step with actions (K, …)."""
@@ -393,7 +400,11 @@ class Environments:
 
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
-        return {"episodes": list(zip(self.num_episodes.tolist(), actions)), "finished": list(self.finished)}
+        episodes = list(zip(self.num_episodes.tolist(), actions))
+        return {"episodes": episodes, "finished": list(self.finished), "checksum": self._checksum()}
+
+    def _checksum(self):
+        return zlib.crc32(self.observations.tobytes())
 
     def close(self):
         for process in getattr(self.vector, "processes", []):
@@ -467,6 +478,8 @@ class Run:
     are written anew from it. Rank 0 alone evaluates, writes and prints.
     """
 
+    training_process = None  # one run at a time: torch has one random generator
+
     def __init__(self, config, script, task, evaluate):
         """`evaluate(policy, task, seed)` plays one episode in a worker process and returns its return and length."""
         if multiprocessing.current_process().daemon:
@@ -491,6 +504,7 @@ class Run:
         self.saved_step = self.checkpoint.get("step", 0)
         self.last_logged = time.monotonic(), self.saved_step
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
+        self.owner = os.urandom(16)  # in a file, until --resume in another process writes its own
         self.stack = contextlib.ExitStack()
 
     def _require_same_run(self, saved):
@@ -504,23 +518,30 @@ class Run:
             raise InputError(f"{self.config.resume} was saved by {processes} processes: continue it with as many")
 
     def __enter__(self):
-        if threading.current_thread() is threading.main_thread():
-            for number in STOP_SIGNALS:
-                if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-                    self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
-        if self.writes:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-            workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
-            self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
-            task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
-            self.pool = futures.ProcessPoolExecutor(workers, context, start_worker, (task,))
-            self.stack.callback(self.pool.shutdown)
-            list(self.pool.map(int, range(workers)))  # starts all: now, before anything uses a GPU or starts threads
-            for worker in set(multiprocessing.active_children()).difference(others):
-                self.stack.callback(worker.kill)
-        keep_freed_memory()
-        self.stack.callback(torch.set_num_threads, torch.get_num_threads())
-        torch.set_num_threads(self.config.num_threads)
+        if Run.training_process == os.getpid():
+            raise InputError("this process trains already: start a process of its own for the other training")
+        Run.training_process = os.getpid()
+        with contextlib.ExitStack() as failing:
+            failing.push(self)  # what fails here is undone and told as later
+            self.stack.callback(setattr, Run, "training_process", None)
+            if threading.current_thread() is threading.main_thread():
+                for number in STOP_SIGNALS:
+                    if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
+                        self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
+            if self.writes:
+                cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+                workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+                self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
+                task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
+                self.pool = futures.ProcessPoolExecutor(workers, context, start_worker, (task,))
+                self.stack.callback(self.pool.shutdown)
+                list(self.pool.map(int, range(workers)))  # starts all before anything uses a GPU or threads
+                for worker in set(multiprocessing.active_children()).difference(others):
+                    self.stack.callback(worker.kill)
+            keep_freed_memory()
+            self.stack.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(self.config.num_threads)
+            failing.pop_all()
         return self
 
     def __exit__(self, kind, error, trace):
@@ -581,7 +602,7 @@ class Run:
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
-        if environments.lost.any():
+        if not environments.resumed_exactly:
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)
 
@@ -599,12 +620,8 @@ class Run:
             why = getattr(error, "strerror", error)
             raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
         text = json.dumps(plain_config(self.config), indent=2) + "\n"
-
-        def write(file):
-            file.write(text.encode())
-            self.claim = os.fstat(file.fileno()).st_ino  # --resume in another process makes a new one
-
-        write_atomically(self.path / "config.json", write)
+        write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
+        write_atomically(self.path / ".owner", lambda file: file.write(self.owner))
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.path.glob(name):
                 path.unlink(missing_ok=True)  # the run may still go on in another process
@@ -728,7 +745,7 @@ class Run:
 
     def _write(self, name, write):
         try:
-            if (self.path / "config.json").stat().st_ino != self.claim:
+            if (self.path / ".owner").read_bytes() != self.owner:
                 raise FileNotFoundError
             write_atomically(self.path / name, write)
         except FileNotFoundError:

@@ -9,8 +9,9 @@
 
 The Q-network estimates Q(s, a), the sum of the rewards from action a in state s on. Each later reward counts γ times
 as much as the one before. Each update moves Q(s, a) towards r + γ max Q(s', ·): s' is the next state, r the reward. A
-slow copy of the Q-network, the target network, computes that maximum, so that the goal moves slowly. The policy takes
-the action of the largest Q. While it collects data, some actions are random: so it explores.
+slow copy of the Q-network, the target network, computes that maximum, so that the goal moves slowly. Advantage
+learning lowers the goal of every action but the best. The policy takes the action of the largest Q. While it collects
+data, some actions are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
@@ -56,8 +57,8 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): scale Q so that an output of 0 is the worth of an endless episode
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): how much of max Q(s, ·) − Q(s, a) a target loses
+    value_unit: bool = True  # ours (theirs: no): scale Q: the output 0 means the worth of an endless episode
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
     tutorial: StrictBool = False  # set every value marked "ours" back to the tutorial's; other flags override it
@@ -107,7 +108,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds over 1000 times as wide as observations (N, O): these would all come to 0."""
+        """Drops bounds over 1000 times as wide as the observations (N, O), which would all be scaled to 0."""
         ranks.average([largest := (observations - self.center).abs().amax(0)])  # in place, over the processes
         beyond = self.half_range > 1000 * largest
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
@@ -216,7 +217,7 @@ def td_targets(rewards, terminated, next_q, gamma):
 
 
 def gap_to_best(q, actions):
-    """max Q(s, ·) − Q(s, a): (B,), for q (B, A) and actions (B,). 0 for the best action (arXiv:1512.04860)."""
+    """max Q(s, ·) − Q(s, a), what the action costs: (B,), for q (B, A) and actions (B,). See arXiv:1512.04860."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
 
@@ -349,7 +350,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect until `due` environment steps are done. The next update follows.
+            # Collect until all environments together have done `due` steps. The next update follows.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.random_actions(config.num_envs) if warming_up else agent.act(envs.observations))

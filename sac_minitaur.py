@@ -93,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The networks (shapes: B batch, K environments, N stored, O numbers observed, S that the critics see, A of an action)
+# The networks (shapes: B batch, K environments, N stored, O numbers observed, S = O + privileged ones, A of an action)
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -461,7 +461,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect until `due` environment steps are done. The physics runs in its worker during the update.
+            # Collect until all environments together have done `due` steps. The physics runs beside the update.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
             if collecting:

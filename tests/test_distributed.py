@@ -211,7 +211,7 @@ def test_first_steps_that_are_too_few_for_two_processes(tmp_path):
     few = ("--num-envs", 1, "--initial-collect-steps", 256, "--batch-size", 258, "--replay-buffer-capacity", 1000)
     ranks = start_ranks(2, "sac_minitaur", flags("sac_minitaur", tmp_path / "run", *few), tmp_path / "output")
     end(ranks, [2, 2])
-    assert ranks[0].stderr == "error: --batch-size 258 is more than the 256 transitions collected first\n"
+    assert ranks[0].stderr == "error: --batch-size 258 is more than the 256 transitions stored at first\n"
     assert not (tmp_path / "run").exists()
 
 

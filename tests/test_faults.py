@@ -12,6 +12,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -121,6 +123,8 @@ def test_checkpoint_of_another_version(script, copy):  # noqa: F811
         change(copy / "checkpoint.pt", config=changed)
         message = refusal(script, "--resume", copy)
         assert "another version" in message and field in message
+    change(copy / "policy.pt", config=older)
+    assert finish(script, ["--evaluate", copy / "policy.pt", "--no-video"], copy / "output").status == 0
     change(copy / "checkpoint.pt", config=config | {"gamma": 2.0})
     assert "no good" in (message := refusal(script, "--resume", copy)) and "gamma" in message
 
@@ -232,6 +236,37 @@ def test_runs_that_start_at_once_have_directories_of_their_own(script):  # noqa:
     config = importlib.import_module(script).Config(device="cpu")
     runs = [common.Run(config, script, None, None) for _ in range(2)]
     assert runs[0].path != runs[1].path and runs[0].path.parent == runs[1].path.parent == Path("runs")
+
+
+def test_one_process_trains_one_agent_at_a_time(script):  # noqa: F811
+    config = importlib.import_module(script).Config(device="cpu")
+    for _ in range(2):
+        with common.Run(config, script, None, None):
+            with pytest.raises(common.InputError, match="this process trains already"):
+                common.Run(config, script, None, None).__enter__()
+
+
+def test_a_run_that_cannot_start_leaves_the_process_as_it_was(script, monkeypatch):  # noqa: F811
+    config = importlib.import_module(script).Config(device="cpu")
+    before = [signal.getsignal(number) for number in common.STOP_SIGNALS]
+    with monkeypatch.context() as disk:
+        disk.setattr(tempfile, "tempdir", "/none")
+        with pytest.raises(common.RunError, match="No such file or directory.*; there is no checkpoint yet"):
+            common.Run(config, script, None, None).__enter__()
+    assert [signal.getsignal(number) for number in common.STOP_SIGNALS] == before
+    with common.Run(config, script, None, None):
+        pass
+
+
+@pytest.mark.parametrize(
+    "error, status", [(common.InputError("bad"), 2), (common.RunError("bad"), 1), (KeyboardInterrupt(), 130)]
+)
+def test_a_command_that_fails_in_a_notebook_leaves_the_kernel(error, status, monkeypatch):
+    """As with %run: what ends is the command, not the process."""
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+    with pytest.raises(SystemExit) as exit:
+        common.run_main(mock.Mock(side_effect=error))
+    assert exit.value.code == status
 
 
 def test_one_directory_for_two_runs_that_start_at_once(tmp_path):

@@ -372,22 +372,33 @@ def test_refusal_at_the_command_line(script, reference, tmp_path):
         assert run.stderr.count("\n") == 1 and run.stderr.startswith("error: ") and word in run.stderr
 
 
-def test_a_task_that_cannot_be_played_again(script, reference, tmp_path):
-    """It draws from a generator that no seed governs: an episode has ended, a new one begins, and the user is told."""
-    shutil.copytree(reference, tmp_path / "run")
-    run = finish(script, ["--resume", tmp_path / "run", "--num-iterations", 320], tmp_path / "output", end_early)
-    assert "warning: an episode went differently" in run.stdout and checkpoint(tmp_path / "run")["step"] == 320
-
-
 class EndsEarly(gym.Wrapper):
+    """As one that draws from a generator that no seed governs: the episode has ended, a new one begins."""
+
     def step(self, action):
         observation, reward, terminated, _, info = self.env.step(action)
         return observation, reward, terminated, True, info
 
 
-def end_early(module):
+class Remembers(gym.ObservationWrapper):
+    """As one that normalizes its observations by all that it has seen."""
+
+    def observation(self, observation):
+        return observation + 1e-3
+
+
+@pytest.mark.parametrize("wrapper", (EndsEarly, Remembers))
+def test_a_task_that_cannot_be_played_again(wrapper, script, reference, tmp_path):
+    """The user is told."""
+    shutil.copytree(reference, tmp_path / "run")
+    arguments = ["--resume", tmp_path / "run", "--num-iterations", 320]
+    run = finish(script, arguments, tmp_path / "output", partial(wrap, wrapper=wrapper))
+    assert "warning: an episode went differently" in run.stdout and checkpoint(tmp_path / "run")["step"] == 320
+
+
+def wrap(module, wrapper):
     make = module.make_training_env
-    module.make_training_env = lambda *arguments: EndsEarly(make(*arguments))
+    module.make_training_env = lambda *arguments: wrapper(make(*arguments))
 
 
 def test_where_processes_are_spawned(reference, script, tmp_path):
@@ -437,7 +448,7 @@ def test_soak(script, tmp_path):
         for path in (tmp_path / "run").glob("*.csv"):
             rows(path)
         arguments = ["--resume", tmp_path / "run"]
-    finish(script, arguments, tmp_path / "last")
+    assert "warning" not in finish(script, arguments, tmp_path / "last").stdout
     assert_same_run(tmp_path / "run", tmp_path / "whole")
     assert_tensorboard_once(tmp_path / "run")
 
