@@ -125,10 +125,9 @@ def read_command_line(config_class, description, script):
             saved, more = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
         else:
             saved, more = read_file(source, "policy", script), {"evaluate": source, "video": True}
-        others = saved["config"].keys() - vars(default).keys()
-        if given.resume:  # a policy may be older than a field that a fork adds
-            others |= vars(default).keys() - saved["config"].keys()
-        if others:
+        known, found = vars(default).keys(), saved["config"].keys()
+        # A policy may be older than a field that a fork adds.
+        if others := found ^ known if given.resume else found - known:
             raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
         try:
             default = config_class(**saved["config"] | more)
