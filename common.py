@@ -408,6 +408,7 @@ class Environments:
     def close(self):
         for process in getattr(self.vector, "processes", []):
             process.kill()  # there is nothing in a worker to save
+            process.join()
             self.vector.closed = True
         self.vector.close()
 
