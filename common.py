@@ -318,7 +318,7 @@ class SeededEpisodes(gym.Wrapper):
         for action in replay:
             observation, _, terminated, truncated, _ = self.step(action)
             if terminated or truncated:
-                return self.reset()[0], {"not_repeatable": True}
+                return self.reset()  # it cannot be repeated: a new episode
         return observation, {}
 
     def step(self, action):
@@ -356,7 +356,7 @@ class Environments:
         saved = {"episodes": [(0, [])] * num_envs, "finished": []}
         if run.checkpoint:
             saved = run.checkpoint["ranks"][rank]["environments"]
-        self.in_workers, self.num_episodes = in_workers, np.array([number for number, _ in saved["episodes"]])
+        self.in_workers = in_workers
         self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
 
         def make(i, episode, actions):
@@ -370,8 +370,8 @@ class Environments:
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self.close)
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
-        self.observations, infos = self.vector.reset()  # brings each to where its episode stands
-        self.num_episodes += infos.get("_not_repeatable", 0)  # where that had to be a new episode
+        self.observations, _ = self.vector.reset()  # brings each to where its episode stands
+        self.num_episodes = np.array(self.vector.get_attr("episode"))
         self.resumed_exactly = saved.get("checksum", self._checksum()) == self._checksum()
 
     def step_async(self, actions):

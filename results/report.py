@@ -134,6 +134,8 @@ def main():
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif "pendulum" in name:
             print_table(name, goal=-200, late=5_000)
+        elif "hopper" in name:
+            print_table(name, goal=3_000, late=50_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
     print_ablation("sac_20000", 20_000)

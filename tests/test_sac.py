@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import importlib.util
 import json
 import math
 import os
@@ -903,3 +904,11 @@ def test_bad_input_as_the_shell_sees_it(tmp_path):
     command = [sys.executable, str(ROOT / "sac_minitaur.py"), "--env-id", "NoSuchTask-v0"]
     process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert_one_line(process.returncode, process.stderr)
+
+
+def test_the_report_reads_every_run(monkeypatch, capsys):
+    spec = importlib.util.spec_from_file_location("report", ROOT / "results" / "report.py")
+    spec.loader.exec_module(report := importlib.util.module_from_spec(spec))
+    monkeypatch.setattr(report, "FIGURES", {})  # draws nothing
+    report.main()
+    assert {"### sac_minitaur", "### sac_hopper"} <= set(capsys.readouterr().out.splitlines())
