@@ -155,7 +155,7 @@ def select_device(name, local_rank=0):
         name = "cuda" if gpus else "cpu"
     device = torch.device(f"cuda:{local_rank}" if name == "cuda" else name)
     if device.type == "mps" and not torch.backends.mps.is_available() or device.type == "cuda" and device.index >= gpus:
-        raise InputError(f"--device {name} is not there (CUDA GPUs found: {gpus}): use auto or cpu")
+        raise InputError(f"--device {device} is not there (CUDA GPUs found: {gpus}): use --device cpu")
     return device
 
 

@@ -41,9 +41,10 @@ class Process:
 
     def __init__(self, script, arguments, output, hook=None, **environ):
         if Process.server is None:
-            Process.server = subprocess.Popen(
-                [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
-            )
+            # A process that has touched a GPU cannot fork ones that use PyTorch's optimizers.
+            environ_of_server = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
+            pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            Process.server = subprocess.Popen([sys.executable, __file__], cwd=ROOT, env=environ_of_server, **pipes)
             atexit.register(Process.server.wait)
             atexit.register(Process.server.stdin.close)  # called first: it ends the server
         self.output = Path(output)

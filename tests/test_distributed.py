@@ -199,6 +199,15 @@ def test_two_processes_solve_cartpole(tmp_path):
     assert max(float(row[header.index("average_return")]) for row in evaluations) >= 195
 
 
+def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
+    for gpus, device in ((0, "cpu"), (2, "cuda:1")):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+        assert common.select_device("auto", local_rank=1) == torch.device(device)
+    for name, rank in (("auto", 2), ("cuda", 2), ("cuda:2", 0)):
+        with pytest.raises(common.InputError, match="--device cuda:2 is not there.*2.*: use --device cpu"):
+            common.select_device(name, rank)
+
+
 def test_batch_that_cannot_be_shared(tmp_path):
     arguments = flags("sac_minitaur", tmp_path / "run", "--batch-size", 25)
     ranks = start_ranks(2, "sac_minitaur", arguments, tmp_path / "output")

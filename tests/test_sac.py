@@ -850,7 +850,7 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
         ("--env-id CartPole-v1", "Discrete"),
         ("--device cuda:77", "cuda:77"),
         ("--batch-size 300", "--batch-size 300"),
-        ("--replay-buffer-capacity 1000000000000", "--replay-buffer-capacity 1000000000000 takes 36000.0 GB"),
+        ("--replay-buffer-capacity 9000000000000000", "--replay-buffer-capacity 9000000000000000 takes 324000000.0 GB"),
         ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
         ("--resume nowhere", "nowhere"),
         ("--resume=", "checkpoint.pt"),  # as of a shell's variable that is not set
