@@ -353,9 +353,8 @@ class Environments:
     def __init__(self, make_env, run, in_workers):
         """With `in_workers` each has a process of its own, so that `step_async` returns at once."""
         seed, num_envs, rank, main = run.config.seed, run.config.num_envs, run.ranks.rank, os.getpid()
-        saved = {"episodes": [(0, [])] * num_envs, "finished": []}
-        if run.checkpoint:
-            saved = run.checkpoint["ranks"][rank]["environments"]
+        new = {"episodes": [(0, [])] * num_envs, "finished": []}
+        saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else new
         self.in_workers = in_workers
         self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
 
@@ -372,7 +371,8 @@ class Environments:
         self.observation_size = math.prod(self.vector.single_observation_space.shape)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         self.num_episodes = np.array(self.vector.get_attr("episode"))
-        self.resumed_exactly = saved.get("checksum", self._checksum()) == self._checksum()
+        checksum = zlib.crc32(self.observations)
+        self.resumed_exactly = saved.get("checksum", checksum) == checksum
 
     def step_async(self, actions):
         """Starts a step with actions (K, …)."""
@@ -400,10 +400,7 @@ class Environments:
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
         episodes = list(zip(self.num_episodes.tolist(), actions))
-        return {"episodes": episodes, "finished": list(self.finished), "checksum": self._checksum()}
-
-    def _checksum(self):
-        return zlib.crc32(self.observations.tobytes())
+        return {"episodes": episodes, "finished": list(self.finished), "checksum": zlib.crc32(self.observations)}
 
     def close(self):
         for process in getattr(self.vector, "processes", []):
