@@ -626,9 +626,7 @@ class Run:
         self.stack.push(lambda kind, *_: kind is not None and issubclass(kind, OSError))  # the same full disk again
         self.stack.callback(self.summary_writer.close)
         for table, rows in self.tables.items():
-            for row in rows:
-                self._write_summary(table, row)
-            self._write_table(table)
+            self._write_rows(table, rows)
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
             self._save("best_policy.pt", "policy", {"weights": weights})
 
@@ -648,20 +646,19 @@ class Run:
     def _log(self, table, step, env_steps, values):
         seconds = round(time.monotonic() - self.started, 3)
         self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
-        self._write_summary(table, self.tables[table][-1])
-        self._write_table(table)
+        self._write_rows(table, self.tables[table][-1:])
 
-    def _write_table(self, table):
+    def _write_rows(self, table, new):
+        """Shows TensorBoard the `new` rows of a table and writes its file, which has all."""
+        for row in new:
+            for name, value in row.items():
+                if name != "step" and math.isfinite(value):
+                    self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
         if rows := self.tables[table]:
             writer = csv.DictWriter(text := io.StringIO(), rows[0], lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
-
-    def _write_summary(self, table, row):
-        for name, value in row.items():
-            if name != "step" and math.isfinite(value):
-                self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
 
     def log_training(self, step, env_steps, environments, metrics):
         """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
