@@ -73,7 +73,7 @@ def run_main(main):
     hook = threading.excepthook
     threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)
     try:
-        main()
+        return main()
     except (InputError, RunError) as error:
         if os.environ.get("RANK", "0") != "0":
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
@@ -81,8 +81,6 @@ def run_main(main):
         status = 1 if isinstance(error, RunError) else 2
     except KeyboardInterrupt:
         status = 130
-    else:
-        return
     if dist.is_initialized():
         os._exit(status)  # the others are not waited for: they may be gone
     sys.exit(status)
