@@ -120,15 +120,15 @@ def read_command_line(config_class, description, script):
     default = config_class(tutorial="--tutorial" in sys.argv)
     if source := given.resume or given.evaluate:
         if given.resume:
-            saved, more = read_file(source / "checkpoint.pt", "checkpoint", script), {"resume": source}
+            saved = read_file(source / "checkpoint.pt", "checkpoint", script)["config"]
+            others = saved.keys() ^ vars(default).keys()
         else:
-            saved, more = read_file(source, "policy", script), {"evaluate": source, "video": True}
-        known, found = vars(default).keys(), saved["config"].keys()
-        # A policy may be older than a field that a fork adds.
-        if others := found ^ known if given.resume else found - known:
+            saved = read_file(source, "policy", script)["config"] | {"video": True}
+            others = saved.keys() - vars(default).keys()  # it may be older than a field that a fork adds
+        if others:
             raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
         try:
-            default = config_class(**saved["config"] | more)
+            default = config_class(**saved)
         except ValueError as error:
             what = " ".join(str(error).split())
             raise InputError(f"{source} has a config that is no good: {what}") from None
