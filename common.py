@@ -686,9 +686,8 @@ class Run:
         policy = policy and copy.deepcopy(policy).cpu()
         seeds = [(seed,) for seed in evaluation_seeds(self.config)]
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
-        while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
-            for episode in under_way.done:
-                episode.result()  # raises what went wrong
+        while futures.wait(episodes, 0.1).not_done and not self.stopping:
+            pass
         if self.stopping:
             return
         row, text = summarize([episode.result() for episode in episodes])
@@ -770,10 +769,9 @@ class Run:
             export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
             with or_warn(name, self.print):
-                while not recording.done():
+                while futures.wait([recording], 0.1).not_done:
                     if self.stopping:
                         return self.print(f"stopped while filming; {self._how_to_continue()}")
-                    time.sleep(0.1)
                 recording.result()
         files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
         self.print(f"finished; {self.path} holds {files}")
