@@ -525,12 +525,11 @@ class Run:
                         self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-                workers, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+                size, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
-                self.pool = futures.ProcessPoolExecutor(workers, context, start_worker, (task,))
-                self.stack.callback(self.pool.shutdown)
-                list(self.pool.map(int, range(workers)))  # starts all before anything uses a GPU or threads
+                self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
+                list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
                 for worker in set(multiprocessing.active_children()).difference(others):
                     self.stack.callback(worker.kill)
             keep_freed_memory()
@@ -590,9 +589,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
-        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
-        self.stack.callback(self.progress.close)
+        bar = {"initial": self.saved_step, "unit": "step", "disable": None if self.writes and sys.stderr else True}
+        self.progress = self.stack.enter_context(tqdm(total=config.num_iterations, **bar))
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
@@ -620,9 +618,8 @@ class Run:
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.path.glob(name):
                 path.unlink(missing_ok=True)  # the run may still go on in another process
-        self.summary_writer = SummaryWriter(self.path)
-        self.stack.push(lambda kind, *_: kind is not None and issubclass(kind, OSError))  # the same full disk again
-        self.stack.callback(self.summary_writer.close)
+        self.stack.enter_context(contextlib.suppress(OSError))  # of the writer's end: the same full disk again
+        self.summary_writer = self.stack.enter_context(SummaryWriter(self.path))
         for table, rows in self.tables.items():
             self._write_rows(table, rows)
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
