@@ -224,9 +224,8 @@ class Ranks:
         """Replaces each tensor by its mean over the ranks, in one collective for all of them."""
         if self.world_size > 1:
             dist.all_reduce(flat := torch.cat([tensor.flatten() for tensor in tensors]))
-            means = (flat / self.world_size).split([tensor.numel() for tensor in tensors])
-            for tensor, mean in zip(tensors, means):
-                tensor.copy_(mean.view_as(tensor))
+            for tensor, total in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
+                tensor.copy_(total.view_as(tensor) / self.world_size)
 
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
