@@ -835,7 +835,7 @@ def plot_learning_curve(path, tables, title, reward_threshold=None):
     returns.legend(fontsize="small")
     for axes, name, title in ((losses, "loss", "loss"), (losses, "critic_loss", "loss"), (values, "mean_q", "mean Q")):
         points = [(row["step"], row[name]) for row in tables["train"] if name in row]
-        axes.plot(*zip(*points) if points else ([], []))
+        axes.plot(*np.reshape(points, (-1, 2)).T)
         axes.set(title=title, xlabel="gradient updates")
     losses.set_yscale("log")
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
