@@ -588,8 +588,9 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        bar = {"initial": self.saved_step, "unit": "step", "disable": None if self.writes and sys.stderr else True}
-        self.progress = self.stack.enter_context(tqdm(total=config.num_iterations, **bar))
+        hidden = not (self.writes and getattr(sys.stderr, "isatty", bool)())
+        bar = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=hidden)
+        self.progress = self.stack.enter_context(bar)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
