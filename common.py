@@ -820,7 +820,9 @@ def evaluate_policy(config, script, policy, task, evaluate):
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
-    from matplotlib.figure import Figure  # without pyplot, which would need the backend that a notebook has set
+    if "ipykernel" not in sys.modules:  # a command that a notebook started: the notebook's backend may be missing
+        os.environ.pop("MPLBACKEND", None)
+    from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     returns, losses, values = figure.subplots(1, 3)
