@@ -134,7 +134,7 @@ def main():
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif "pendulum" in name:
             print_table(name, goal=-200, late=5_000)
-        elif "hopper" in name:
+        elif name in ("sac_hopper", "sac_halfcheetah"):
             print_table(name, goal=3_000, late=50_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
