@@ -683,8 +683,9 @@ class Run:
         policy = policy and copy.deepcopy(policy).cpu()
         seeds = [(seed,) for seed in evaluation_seeds(self.config)]
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
-        while futures.wait(episodes, 0.1).not_done and not self.stopping:
-            pass
+        while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
+            for episode in under_way.done:
+                episode.result()  # raises what went wrong
         if self.stopping:
             return
         row, text = summarize([episode.result() for episode in episodes])

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
@@ -223,6 +224,24 @@ def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, regi
         train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
     text = str(caught.value)
     assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
+
+
+def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeypatch, tmp_path):
+    failing, slow = common.evaluation_seeds(Config(**TINY))
+    reset = Echo.reset
+
+    def reset_by_seed(self, *, seed=None, options=None):
+        if seed == failing:
+            raise ValueError("no server")
+        if seed == slow:
+            time.sleep(20)
+            (tmp_path / "waited for").touch()
+        return reset(self, seed=seed)
+
+    monkeypatch.setattr(Echo, "reset", reset_by_seed)
+    with pytest.raises(common.TaskError, match="no server"):
+        train(tmp_path / "run", **SHORT, **IDS)
+    assert not (tmp_path / "waited for").exists()
 
 
 def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypatch, tmp_path):
