@@ -124,7 +124,7 @@ def read_command_line(config_class, description, script):
             others = saved.keys() ^ vars(default).keys()
         else:
             saved = read_file(source, "policy", script)["config"] | {"video": True}
-            others = saved.keys() - vars(default).keys()  # it may be older than a field that a fork adds
+            others = saved.keys() - vars(default).keys()  # a policy may be older than a fork's field
         if others:
             raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
         try:
@@ -588,9 +588,9 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        hidden = not (self.writes and getattr(sys.stderr, "isatty", bool)())
-        bar = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=hidden)
-        self.progress = self.stack.enter_context(bar)
+        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
+        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
+        self.stack.enter_context(self.progress)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
