@@ -514,7 +514,7 @@ class Run:
     def __enter__(self):
         if Run.training_process == os.getpid():
             raise InputError("this process trains already: start a process of its own for the other training")
-        Run.training_process = os.getpid()
+        Run.training_process, config = os.getpid(), self.config
         with contextlib.ExitStack() as failing:
             failing.push(self)  # what fails here is undone and told as later
             self.stack.callback(setattr, Run, "training_process", None)
@@ -524,7 +524,7 @@ class Run:
                         self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-                size, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+                size, context = min(cores, config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
@@ -533,7 +533,9 @@ class Run:
                     self.stack.callback(worker.kill)
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
-            torch.set_num_threads(self.config.num_threads)
+            torch.set_num_threads(config.num_threads)
+            where = f"device {self.device}, {config.num_threads} CPU thread(s), {self.ranks.world_size} process(es)"
+            self.print(f"{config.env_id}, seed {config.seed}, {where}")
             failing.pop_all()
         return self
 
@@ -568,7 +570,7 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint, if any, begins the files, and says what is trained, on what, and where.
+        """Restores the checkpoint, if any, begins the files, and says where they lie.
 
         Returns the gradient updates and the environment steps done so far. There is no directory before this, when all
         that the user gave has been found usable.
@@ -592,9 +594,8 @@ class Run:
         self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
         self.stack.enter_context(self.progress)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
-        self.print(f"{config.env_id}, seed {config.seed}, {limit}")
-        self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
-        self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
+        self.print(f"{limit}, replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full")
+        self.print(f"run directory {self.path}")
         if not environments.resumed_exactly:
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)
