@@ -7,11 +7,11 @@
     python dqn_cartpole.py --tutorial                         # the tutorial's own choices, which are less stable
     torchrun --nproc-per-node 2 dqn_cartpole.py               # two processes, one agent
 
-The Q-network estimates Q(s, a), the sum of the rewards from action a in state s on. Each later reward counts γ times
-as much as the one before. Each update moves Q(s, a) towards r + γ max Q(s', ·): s' is the next state, r the reward. A
-slow copy of the Q-network, the target network, computes that maximum, so that the goal moves slowly. Advantage
-learning lowers the goal of every action but the best. The policy takes the action of the largest Q. While it collects
-data, some actions are random: so it explores.
+The Q-network estimates Q(s, a), the sum of the rewards that follow action a in state s. Each later reward counts γ
+times as much as the one before. Each update moves Q(s, a) towards a target, r + γ max Q(s', ·): r is the reward, s' the
+next state, and the maximum is over all actions there. A slow copy of the Q-network, the target network, computes that
+maximum, so that the target moves slowly. Advantage learning lowers the target of every action but the best. The policy
+takes the action of the largest Q. While it collects data, some actions are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
@@ -57,7 +57,7 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): scale Q: the output 0 means the worth of an endless episode
+    value_unit: bool = True  # ours (theirs: no): the network's output 0 means the worth of an endless episode
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -170,7 +170,7 @@ class Policy(nn.Module):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. At a time limit
+    One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
     the episode could go on, so its last state has a value: only `terminated` marks an end.
     """
 
@@ -180,7 +180,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy arrays (K, O), (K,). A full buffer overwrites its oldest."""
+        """Stores K transitions, numpy (K, O), (K,), (K,), (K,), (K, O). A full buffer overwrites its oldest."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
         for row in rows:
@@ -238,18 +238,18 @@ class DQNAgent(nn.Module):
         self.register_buffer("value_offset", torch.tensor(0.0))
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.to(device)
-        adam = {"eps": config.adam_epsilon, "fused": device.type != "mps"}
+        adam = {"eps": config.adam_epsilon, "fused": True}  # fused: one operation for all parameters
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), config.learning_rate, **adam)
-        self.optimizers = [self.optimizer]
+        self.optimizers = [self.optimizer]  # for the checkpoint
 
     def random_actions(self, count):
         """Uniform actions (K,), numpy."""
         return torch.randint(self.num_actions, (count,)).numpy()
 
     def fit_scaling(self, observations, rewards):
-        """Fixes the scales of observations and values by observations (N, O) and rewards (N,) of all ranks.
+        """Fits the scales to the observations (N, O) and rewards (N,) of this rank, averaged over the ranks.
 
-        An output of 0 then means the return of an endless episode. The network learns what an early end costs.
+        An output of 0 then means the return of an endless episode. The network learns what an early end changes.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
@@ -280,7 +280,7 @@ class DQNAgent(nn.Module):
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
         s, next_s = self.scaling(s), self.scaling(next_s)  # ours
         with torch.no_grad():
-            next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
+            next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·), the target network's: (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
             if config.advantage_learning:  # ours: y − weight × (max Q̄(s, ·) − Q̄(s, a)), so worse actions fall further
                 y -= config.advantage_learning * gap_to_best(self.q_values(self.target_network, s), a)
@@ -293,7 +293,7 @@ class DQNAgent(nn.Module):
             self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         self.optimizer.step()
 
-        with torch.no_grad():  # θ̄ ← θ̄ + τ (θ − θ̄)
+        with torch.no_grad():  # the target network's weights: θ̄ ← θ̄ + τ (θ − θ̄)
             for target, parameter in zip(self.target_network.parameters(), self.q_network.parameters()):
                 target.lerp_(parameter, config.target_update_tau)  # ours: τ below 1
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
@@ -333,13 +333,13 @@ def train(config):
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
         batch_size = run.ranks.batch_share(config)
-        # They step in this process: a message to a worker takes longer than a step of CartPole.
+        # The environments step here: a message to a worker takes longer than a step of CartPole.
         envs = common.Environments(partial(make_training_env, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
-        step, env_steps = run.start(agent, buffer, envs)
+        step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
@@ -350,7 +350,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect until all environments together have done `due` steps. The next update follows.
+            # One step each time, until all environments together have done `due` steps. The next update follows.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.random_actions(config.num_envs) if warming_up else agent.act(envs.observations))
@@ -358,7 +358,7 @@ def train(config):
                 env_steps += config.num_envs * run.ranks.world_size
                 if warming_up and env_steps >= config.initial_collect_steps:
                     agent.fit_scaling(*buffer.observations_and_rewards())
-            if env_steps >= due and not warming_up:  # not before the scales are fitted
+            if env_steps >= due and not warming_up:  # the evaluation of step 0 comes before
                 metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
                 run.progress.update()

@@ -8,9 +8,9 @@
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
 The actor samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
-earns much, yet stays as random as it can, and so it explores. α is tuned until the entropy has a given value. Actor and
-critics learn from the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its
-errors.
+earns much, yet stays as random as it can, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until
+the entropy has a given value. Actor and critics learn from the smaller of the two estimates of Q, because an actor that
+maximizes one estimate exploits its errors.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
@@ -45,10 +45,10 @@ class Config:
     initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
-    replay_buffer_capacity: PositiveInt = 1_000_000  # ours, 2018's (later: 10 000): transitions kept by each process
+    replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
-    actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
+    actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ below (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
@@ -115,7 +115,7 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
 
 
 class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O numbers of an observation."""
+    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O of S numbers."""
 
     def __init__(self, observation_size, action_size, hidden_layers):
         super().__init__()
@@ -196,7 +196,7 @@ def require_finite(actions):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling a single gather. At a time limit
+    One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
     the episode could go on, so its last state has a value: only `terminated` marks an end.
     """
 
@@ -287,7 +287,7 @@ class SACAgent(nn.Module):
         self.policy.actor.load_state_dict(self.actor.state_dict())
         self.to(device)
 
-        adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": device.type != "mps"}
+        adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, which learn from the same sample of actions.
         groups = [
@@ -295,14 +295,14 @@ class SACAgent(nn.Module):
             {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
         ]
         self.actor_optimizer = torch.optim.Adam(groups, **adam)
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer]
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     def fit_reward_scale(self, rewards):
-        """Divides the scale of rewards by the standard deviation of the rewards (N,) of all ranks."""
+        """Divides the scale by the standard deviation of the rewards (N,) of this rank, averaged over the ranks."""
         if self.config.reward_scaling:
             mean = rewards.mean()
             self.ranks.average([mean])  # in place, over the processes
@@ -359,7 +359,7 @@ class SACAgent(nn.Module):
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
         self._step(self.actor_optimizer, loss_pi + loss_alpha)
 
-        # θ̄ ← θ̄ + τ (θ − θ̄)
+        # Their weights: θ̄ ← θ̄ + τ (θ − θ̄)
         follow(self.policy.actor, self.actor, config.averaged_actor_tau)
         if self.target_critics:
             follow(self.target_critics, self.critics, config.target_update_tau)
@@ -377,7 +377,7 @@ class SACAgent(nn.Module):
         optimizer.zero_grad()
         loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
         # Several processes: the mean of their gradients, and of batch normalization's running statistics.
-        statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]
+        statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]  # not the count of batches
         self.ranks.average([parameter.grad for parameter in parameters] + statistics)
         optimizer.step()
 
@@ -409,7 +409,7 @@ def evaluate(policy, task, seed):
 
 
 class AppendPrivileged(gym.ObservationWrapper):
-    """Appends `privileged_observation()` (P,), for the critics, to every observation (O,)."""
+    """Appends `privileged_observation()` (S − O,), for the critics, to every observation (O,)."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -450,7 +450,7 @@ def train(config):
         sizes = envs.observation_size, math.prod(action_space.shape)
         buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
-        step, env_steps = run.start(agent, buffer, envs)
+        step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
@@ -461,7 +461,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # Collect until all environments together have done `due` steps. The physics runs beside the update.
+            # One step each time, until all environments together have done `due`. The physics runs beside the update.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
             if collecting:
@@ -698,7 +698,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # disconnects once: a newer simulation may get the same number
+        self.simulator = None  # its finalizer disconnects, and only once: a newer simulation may have this number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
