@@ -98,7 +98,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d\d?)?)$")]
-Threads = Annotated[int, Field(ge=1, le=1024)]
+Parallel = Annotated[int, Field(ge=1, le=1024)]  # environments, threads
 Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
@@ -288,24 +288,29 @@ def start_worker(task=None):
 
     `task` is what an evaluation's worker plays.
     """
-    start_worker.task = task
+    start_worker.task, worker = task, os.getpid()
     torch.set_num_threads(1)
+    np.random.seed()  # a task may use this generator: forked, all workers would draw the same
     for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+        # What a task has started goes on at Ctrl-C, too. But the task can terminate it.
+        ignore = signal.SIG_IGN if number == signal.SIGINT else lambda *_: os.getpid() == worker or os._exit(1)
+        signal.signal(number, ignore)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
 class SeededEpisodes(gym.Wrapper):
-    """Seeds every episode by (seed, env index, episode number) and can begin in the middle of one.
+    """Flat float32 observations of a task. Every episode has a seed of its own, and can be begun in its middle.
 
-    No simulator can be saved in mid-episode. But an episode follows from its seed and its actions: played again from
-    the reset, it comes to the same state to the last bit. Copies are kept: a task may change an array it was given or
-    has returned.
+    The seed comes from (seed, env index, episode number). No simulator can be saved in mid-episode. But an episode
+    follows from its seed and its actions: played again from the reset, it comes to the same state to the last bit.
+    Copies are kept: a task may change an array it was given or has returned.
     """
 
     def __init__(self, env, key, episode, actions):
         super().__init__(env)
         self.key, self.episode, self.actions = key, episode, list(actions)
+        # Not the type of the task's own space: a task may return numbers that this type would cut.
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (math.prod(env.observation_space.shape),))
 
     def reset(self, **_):
         replay, self.actions, self.total = self.actions, [], 0.0
@@ -332,17 +337,17 @@ class SeededEpisodes(gym.Wrapper):
         return observation, reward, bool(terminated), bool(truncated), info
 
     def _checked(self, observation, reward=0.0):
-        """A copy of the observation, if it has the shape of its space and is finite in float32, as is the reward."""
-        observation, shape = np.array(observation), self.observation_space.shape
-        if observation.shape != shape:
-            raise ValueError(f"it returned an observation of shape {observation.shape}, but its space has {shape}")
-        if not (np.isfinite(np.float32(reward)) and np.isfinite(np.float32(observation)).all()):
+        """A flat copy of the observation, if it has its space's shape and is finite in float32, as is the reward."""
+        flat, shape = np.array(observation, np.float32), self.env.observation_space.shape
+        if flat.shape != shape:
+            raise ValueError(f"it returned an observation of shape {flat.shape}, but its space has {shape}")
+        if not (np.isfinite(np.float32(reward)) and np.isfinite(flat).all()):
             raise ValueError(f"it returned the reward {reward} and the observation {observation}: not all finite")
-        return observation
+        return flat.ravel()
 
 
 class Environments:
-    """K environments of one task, stepped together; `observations` (K, …) are those to act on.
+    """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on.
 
     `num_episodes` (K,) counts the episodes that have ended in each.
     """
@@ -362,14 +367,16 @@ class Environments:
                 return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
 
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
-        kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
+        kind = gym.vector.SyncVectorEnv
+        if in_workers:  # not daemons: a task may start processes
+            kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self.close)
-        self.observation_size = math.prod(self.vector.single_observation_space.shape)
+        (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         self.num_episodes = np.array(self.vector.get_attr("episode"))
-        checksum = zlib.crc32(self.observations)
-        self.resumed_exactly = saved.get("checksum", checksum) == checksum
+        fingerprint = self._fingerprint()
+        self.resumed_exactly = saved.get("fingerprint", fingerprint) == fingerprint
 
     def step_async(self, actions):
         """Starts a step with actions (K, …)."""
@@ -378,8 +385,8 @@ class Environments:
             self.vector.step_async(actions)
 
     def step_wait(self):
-        """The transitions of that step: observations (K, …), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, …). The last are the true ones where an episode has ended and was reset."""
+        """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
+        observations (K, O). The last are the true ones where an episode has ended and was reset."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
@@ -397,11 +404,18 @@ class Environments:
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
         episodes = list(zip(self.num_episodes.tolist(), actions))
-        return {"episodes": episodes, "finished": list(self.finished), "checksum": zlib.crc32(self.observations)}
+        return {"episodes": episodes, "finished": list(self.finished), "fingerprint": self._fingerprint()}
+
+    def _fingerprint(self):
+        """Tells where the running episodes stand: a checksum of their last observations and returns so far."""
+        return zlib.crc32(np.array(self.vector.get_attr("total")), zlib.crc32(self.observations))
 
     def close(self):
-        for process in getattr(self.vector, "processes", []):
-            process.kill()  # there is nothing in a worker to save
+        for process, pipe in zip(getattr(self.vector, "processes", []), getattr(self.vector, "parent_pipes", [])):
+            with contextlib.suppress(OSError, AttributeError):  # it has died
+                pipe.send(("close", None))  # the task may have to end what it has started
+            process.join(2)
+            process.kill()
             process.join()
             self.vector.closed = True
         self.vector.close()
@@ -514,7 +528,7 @@ class Run:
     def __enter__(self):
         if Run.training_process == os.getpid():
             raise InputError("this process trains already: start a process of its own for the other training")
-        Run.training_process, config = os.getpid(), self.config
+        Run.training_process = os.getpid()
         with contextlib.ExitStack() as failing:
             failing.push(self)  # what fails here is undone and told as later
             self.stack.callback(setattr, Run, "training_process", None)
@@ -524,7 +538,7 @@ class Run:
                         self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-                size, context = min(cores, config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+                size, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
@@ -533,9 +547,7 @@ class Run:
                     self.stack.callback(worker.kill)
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
-            torch.set_num_threads(config.num_threads)
-            where = f"device {self.device}, {config.num_threads} CPU thread(s), {self.ranks.world_size} process(es)"
-            self.print(f"{config.env_id}, seed {config.seed}, {where}")
+            torch.set_num_threads(self.config.num_threads)
             failing.pop_all()
         return self
 
@@ -546,6 +558,8 @@ class Run:
         if died or lost or isinstance(error, OSError):
             reason = "a worker process died" if died else "lost another process: " * lost + first_line(error)
             raise RunError(f"{reason}; {self._how_to_continue()}") from error
+        if isinstance(error, TaskError):
+            self.print(self._how_to_continue())
 
     def _how_to_continue(self):
         if not (self.path / "checkpoint.pt").exists():
@@ -556,6 +570,8 @@ class Run:
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):
+        if os.getpid() != Run.training_process:
+            os._exit(1)  # forked by the task, which ends it so
         if self.stopping and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stopping = True
@@ -570,7 +586,7 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint, if any, begins the files, and says where they lie.
+        """Restores the checkpoint, if any, begins the files, and says what is trained, on what, and where.
 
         Returns the gradient updates and the environment steps done so far. There is no directory before this, when all
         that the user gave has been found usable.
@@ -594,8 +610,9 @@ class Run:
         self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
         self.stack.enter_context(self.progress)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
-        self.print(f"{limit}, replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full")
-        self.print(f"run directory {self.path}")
+        self.print(f"{config.env_id}, seed {config.seed}, {limit}")
+        self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
+        self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         if not environments.resumed_exactly:
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
         return self.saved_step, saved.get("env_steps", 0)

@@ -47,7 +47,7 @@ class Config:
     num_iterations: PositiveInt = 20_000  # gradient updates
     initial_collect_steps: PositiveInt = 100  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
-    num_envs: PositiveInt = 1  # environments that each process steps at once
+    num_envs: common.Parallel = 1  # environments that each process steps at once
     replay_buffer_capacity: PositiveInt = 100_000  # transitions kept by each process
     batch_size: PositiveInt = 64  # transitions per update, over all processes
 
@@ -65,7 +65,7 @@ class Config:
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Threads = 1  # CPU threads of the update; more gain nothing here
+    num_threads: common.Parallel = 1  # CPU threads of the update; more gain nothing here
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
@@ -160,8 +160,8 @@ class Policy(nn.Module):
 
     @torch.inference_mode()
     def act(self, observation):
-        """The action for one raw observation: numpy to int."""
-        return int(self(torch.from_numpy(np.array(observation, np.float32))[None]))
+        """The action for one raw observation, from numpy to numpy."""
+        return self(torch.from_numpy(np.array(observation, np.float32))[None]).numpy()[0]
 
 
 # The replay buffer
@@ -318,11 +318,6 @@ def evaluate(policy, task, seed):
 # Training
 
 
-def make_training_env(task):
-    """The task with flat observations, as the agent sees it."""
-    return gym.wrappers.FlattenObservation(gym.make(task))
-
-
 def train(config):
     """Trains as `config` says and returns the run directory's path.
 
@@ -334,7 +329,7 @@ def train(config):
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
         batch_size = run.ranks.batch_share(config)
         # The environments step here: a message to a worker takes longer than a step of CartPole.
-        envs = common.Environments(partial(make_training_env, task), run, in_workers=False)
+        envs = common.Environments(partial(gym.make, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)

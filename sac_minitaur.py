@@ -44,7 +44,7 @@ class Config:
     num_iterations: PositiveInt = 100_000  # gradient updates
     initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
-    num_envs: PositiveInt = 1  # environments that each process steps at once, each in a worker process of its own
+    num_envs: common.Parallel = 1  # environments that each process steps at once, each in a worker process of its own
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
@@ -70,7 +70,7 @@ class Config:
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Threads = 1  # CPU threads of the update: 1 is best on two cores, 4 on sixteen
+    num_threads: common.Parallel = 1  # CPU threads of the update: 1 is best on two cores, 4 on sixteen
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
@@ -421,7 +421,7 @@ class AppendPrivileged(gym.ObservationWrapper):
 
 
 def make_training_env(task, privileged):
-    """The task with flat observations and actions in [-1, 1], as the agent sees it in training.
+    """The task with actions in [-1, 1], as the agent sees it in training.
 
     With `privileged` the observations end with what only the critics see, where the environment has that.
     """
@@ -430,7 +430,6 @@ def make_training_env(task, privileged):
     if (low != -1).any() or (high != 1).any() or dtype != np.float32:
         unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
         env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
-    env = gym.wrappers.FlattenObservation(env)
     return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
 
 

@@ -387,7 +387,14 @@ class Remembers(gym.ObservationWrapper):
         return observation + 1e-3
 
 
-@pytest.mark.parametrize("wrapper", (EndsEarly, Remembers))
+class RemembersRewards(gym.RewardWrapper):
+    """As one that normalizes its rewards so. Its observations repeat."""
+
+    def reward(self, reward):
+        return reward + 1e-3
+
+
+@pytest.mark.parametrize("wrapper", (EndsEarly, Remembers, RemembersRewards))
 def test_a_task_that_cannot_be_played_again(wrapper, script, reference, tmp_path):
     """The user is told."""
     shutil.copytree(reference, tmp_path / "run")
@@ -397,8 +404,12 @@ def test_a_task_that_cannot_be_played_again(wrapper, script, reference, tmp_path
 
 
 def wrap(module, wrapper):
-    make = module.make_training_env
-    module.make_training_env = lambda *arguments: wrapper(make(*arguments))
+    begin = common.Environments.__init__
+
+    def begin_wrapped(self, make_env, *more, **named):
+        begin(self, lambda: wrapper(make_env()), *more, **named)
+
+    common.Environments.__init__ = begin_wrapped
 
 
 def test_where_processes_are_spawned(reference, script, tmp_path):

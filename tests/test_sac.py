@@ -818,8 +818,8 @@ def assert_one_line(status, stderr):
 
 OUT_OF_RANGE = """
     --batch-size 0, --num-iterations -5, --initial-collect-steps 0, --collect-steps-per-iteration 0, --num-envs 0,
-    --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000, --log-interval 0,
-    --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0,
+    --num-envs 1025, --replay-buffer-capacity -1, --max-episode-steps 0, --num-threads 0, --num-threads 1000000000,
+    --log-interval 0, --eval-interval -1, --num-eval-episodes 0, --checkpoint-interval 0, --critic-layers 0,
     --actor-layers 1000000000, --device tpu, --device cuda:128, --actor-learning-rate -1,
     --critic-learning-rate nan, --adam-epsilon -1, --adam-beta1 1, --gamma 1.01, --target-update-tau -0.1,
     --averaged-actor-tau 7, --reward-scale-factor inf, --initial-log-alpha nan, --seed -1,

@@ -1,5 +1,6 @@
 """Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 import common
+import dqn_cartpole
 import sac_minitaur
 from sac_minitaur import Config, Policy
 from test_sac import TINY, load_policy, main, read_checkpoint, read_csv, train
@@ -26,8 +28,8 @@ SHORT = dict(initial_collect_steps=40, num_iterations=20, replay_buffer_capacity
 class Echo(gym.Env):
     """Observes the number of the step and the action just taken, and checks that the action is in its space."""
 
-    def __init__(self, low=-1, high=1, dtype=np.float32, in_place=False, fails=None, error=None):
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    def __init__(self, low=-1, high=1, dtype=np.float32, in_place=False, fails=None, error=None, observations=None):
+        self.observation_space = observations or gym.spaces.Box(-np.inf, np.inf, (2,))
         self.action_space = gym.spaces.Box(low, high, (1,), dtype)
         self.in_place, self.fails, self.error = in_place, fails, error
         self.state = np.zeros(2, np.float32)
@@ -61,6 +63,24 @@ class Unrepeatable(Echo):
     def step(self, action):
         observation, reward, *_ = super().step(action)
         return observation, reward, bool(self.state[0] >= self.length), False, {}
+
+
+class Starts(Echo):
+    """Starts a program and a process, and ends them. `pids` is a file."""
+
+    def __init__(self, pids):
+        super().__init__()
+        self.program = subprocess.Popen(["sleep", "600"])
+        self.process = multiprocessing.Process(target=time.sleep, args=(600,))
+        self.process.start()
+        with open(pids, "a") as file:
+            file.write(f"{self.program.pid} {self.process.pid} ")
+
+    def close(self):
+        for each in (self.program, self.process):
+            each.terminate()
+        self.program.wait()
+        self.process.join()
 
 
 class TwoArguments(Exception):
@@ -189,6 +209,40 @@ def test_observations_of_every_layout(layout, monkeypatch, tmp_path):
     assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 4
 
 
+@pytest.mark.parametrize("kind, scale", [(np.uint8, 1 / 4), (np.int8, 200), (np.float16, 1e5)])
+def test_observations_are_stored_as_they_are_returned(kind, scale, monkeypatch, register, tmp_path):
+    """Though the type of their space could not hold them."""
+    right = Echo._observation
+    monkeypatch.setattr(Echo, "_observation", lambda self: scale * right(self))
+    path, _ = train(tmp_path / "run", **SHORT, env_id=register(observations=gym.spaces.Box(0, 9, (2,), kind)))
+    rows = read_checkpoint(path)[1]["buffer"]["rows"]
+    assert rows[:, 0].unique().tolist() == [0, scale, 2 * scale, 3 * scale]
+
+
+def test_a_task_that_draws_from_numpys_own_generator_draws_anew_in_every_worker(monkeypatch, tmp_path):
+    monkeypatch.setattr(Echo, "_observation", lambda self: np.random.rand(2))
+    path, _ = train(tmp_path / "run", **SHORT, **IDS, num_envs=3)
+    rows = read_checkpoint(path)[1]["buffer"]["rows"]
+    assert len(rows[:, 0].unique()) == len(rows)
+
+
+@pytest.mark.parametrize("in_workers", [True, False])
+def test_what_a_task_starts_is_ended_with_it(in_workers, monkeypatch, tmp_path):
+    new = {"entry_point": Starts, "max_episode_steps": 4, "kwargs": {"pids": tmp_path / "pids"}}
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", **new))
+    begin = common.Environments.__init__
+    monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=in_workers))
+    train(tmp_path / "run", **SHORT, env_id="Mine-v0", num_envs=2)
+    pids = (tmp_path / "pids").read_text().split()
+    assert len(pids) >= 2 * 7 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+
+
+def test_dqns_policy_gives_a_task_the_type_of_action_that_its_space_has(monkeypatch):
+    spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)
+    policy = dqn_cartpole.Policy(dqn_cartpole.Config(), *spaces)
+    assert type(policy.act(np.zeros(2))) is type(spaces[1].sample())
+
+
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])  # the last is too large for float32
 @pytest.mark.parametrize("where", ["reward", "observation", "first observation"])
@@ -203,7 +257,7 @@ def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_p
         monkeypatch.setattr(Echo, "reset", lambda self, **more: (np.full(2, value), reset(self, **more)[1]))
     else:
         monkeypatch.setattr(Echo, "step", bad_step)
-    shown = r"(1e\+39|inf)" if value == 1e39 else value
+    shown = r"(1\.?e\+39|inf)" if value == 1e39 else value
     with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{shown}.*not all finite"):
         train(tmp_path / "run", **SHORT, **IDS)
 
@@ -219,11 +273,12 @@ def test_a_task_that_returns_another_shape(when, wrong, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7), SystemExit])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
-def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path):
+def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path, capsys):
     with pytest.raises(common.TaskError) as caught:
         train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
     text = str(caught.value)
     assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
+    assert ("--resume" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
 
 
 def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeypatch, tmp_path):
