@@ -288,13 +288,12 @@ def start_worker(task=None):
 
     `task` is what an evaluation's worker plays.
     """
-    start_worker.task, worker = task, os.getpid()
+    start_worker.task = task
     torch.set_num_threads(1)
     np.random.seed()  # a task may use this generator: forked, all workers would draw the same
     for number in STOP_SIGNALS:
-        # What a task has started goes on at Ctrl-C, too. But the task can terminate it.
-        ignore = signal.SIG_IGN if number == signal.SIGINT else lambda *_: os.getpid() == worker or os._exit(1)
-        signal.signal(number, ignore)
+        # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else lambda *_: None)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
@@ -367,9 +366,7 @@ class Environments:
                 return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
 
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
-        kind = gym.vector.SyncVectorEnv
-        if in_workers:  # not daemons: a task may start processes
-            kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
+        kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self.close)
         (self.observation_size,) = self.vector.single_observation_space.shape
@@ -570,8 +567,6 @@ class Run:
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):
-        if os.getpid() != Run.training_process:
-            os._exit(1)  # forked by the task, which ends it so
         if self.stopping and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stopping = True
