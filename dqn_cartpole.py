@@ -338,9 +338,15 @@ def train(config):
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
-        while step < config.num_iterations:
-            warming_up = env_steps < config.initial_collect_steps
-            if step % config.eval_interval == 0 and not warming_up:
+        # Random actions first. The scales are fitted to what they lead to.
+        while env_steps < config.initial_collect_steps and not run.stop_requested(step):
+            envs.step_async(agent.random_actions(config.num_envs))
+            buffer.add(*envs.step_wait())
+            env_steps += config.num_envs * run.ranks.world_size
+            if env_steps >= config.initial_collect_steps:
+                agent.fit_scaling(*buffer.observations_and_rewards())
+        while step < config.num_iterations and not run.stopped:
+            if step % config.eval_interval == 0:
                 run.evaluate(step, env_steps, agent.policy)
             if run.stop_requested(step):
                 break
@@ -348,12 +354,10 @@ def train(config):
             # One step each time, until all environments together have done `due` steps. The next update follows.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
-                envs.step_async(agent.random_actions(config.num_envs) if warming_up else agent.act(envs.observations))
+                envs.step_async(agent.act(envs.observations))
                 buffer.add(*envs.step_wait())
                 env_steps += config.num_envs * run.ranks.world_size
-                if warming_up and env_steps >= config.initial_collect_steps:
-                    agent.fit_scaling(*buffer.observations_and_rewards())
-            if env_steps >= due and not warming_up:  # the evaluation of step 0 comes before
+            if env_steps >= due:
                 metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
                 run.progress.update()

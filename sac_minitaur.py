@@ -453,9 +453,15 @@ def train(config):
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
-        while step < config.num_iterations:
-            warming_up = env_steps < config.initial_collect_steps
-            if step % config.eval_interval == 0 and not warming_up:
+        # Random actions first. The scale of the rewards is fitted to what they earn.
+        while env_steps < config.initial_collect_steps and not run.stop_requested(step):
+            envs.step_async(agent.random_actions(config.num_envs))
+            buffer.add(*envs.step_wait())
+            env_steps += config.num_envs * run.ranks.world_size
+            if env_steps >= config.initial_collect_steps:
+                agent.fit_reward_scale(buffer.rewards())
+        while step < config.num_iterations and not run.stopped:
+            if step % config.eval_interval == 0:
                 run.evaluate(step, env_steps, agent.policy)
             if run.stop_requested(step):
                 break
@@ -464,14 +470,10 @@ def train(config):
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
             if collecting:
-                if warming_up:
-                    actions = agent.random_actions(config.num_envs)
-                else:
-                    deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
-                    actions = agent.act(envs.observations, deterministic)
-                envs.step_async(actions)
+                deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
+                envs.step_async(agent.act(envs.observations, deterministic))
                 env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due and not warming_up:  # not before the reward scale is fitted
+            if env_steps >= due:
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
                 run.progress.update()
@@ -479,8 +481,6 @@ def train(config):
                     run.log_training(step, env_steps, envs, metrics)
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
-                if warming_up and env_steps >= config.initial_collect_steps:
-                    agent.fit_reward_scale(buffer.rewards())
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
