@@ -341,7 +341,7 @@ class SeededEpisodes(gym.Wrapper):
         if flat.shape != shape:
             raise ValueError(f"it returned an observation of shape {flat.shape}, but its space has {shape}")
         if not (np.isfinite(np.float32(reward)) and np.isfinite(flat).all()):
-            raise ValueError(f"it returned the reward {reward} and the observation {observation}: not all finite")
+            raise ValueError(f"it returned the reward {reward} and the observation {flat}: not all finite")
         return flat.ravel()
 
 
@@ -408,9 +408,10 @@ class Environments:
         return zlib.crc32(np.array(self.vector.get_attr("total")), zlib.crc32(self.observations))
 
     def close(self):
-        for process, pipe in zip(getattr(self.vector, "processes", []), getattr(self.vector, "parent_pipes", [])):
-            with contextlib.suppress(OSError, AttributeError):  # it has died
+        for pipe in getattr(self.vector, "parent_pipes", []):
+            with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
+        for process in getattr(self.vector, "processes", []):
             process.join(2)
             process.kill()
             process.join()

@@ -283,6 +283,12 @@ def test_policy_is_greedy():
     assert agent.policy(observations).tolist() == q.argmin(1).tolist()
 
 
+def test_policy_gives_a_task_the_type_of_action_that_its_space_has():
+    spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)
+    policy = dqn_cartpole.Policy(dqn_cartpole.Config(), *spaces)
+    assert type(policy.act(np.zeros(2))) is type(spaces[1].sample())
+
+
 def tensors(tree):
     """All tensors in nested dicts, lists and tuples, in order."""
     if isinstance(tree, torch.Tensor):

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 import common
-import dqn_cartpole
 import sac_minitaur
 from sac_minitaur import Config, Policy
 from test_sac import TINY, load_policy, main, read_checkpoint, read_csv, train
@@ -232,12 +231,6 @@ def test_the_program_that_a_task_starts_is_ended_with_it(in_workers, monkeypatch
     assert len(pids) >= 7 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def test_dqns_policy_gives_a_task_the_type_of_action_that_its_space_has(monkeypatch):
-    spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)
-    policy = dqn_cartpole.Policy(dqn_cartpole.Config(), *spaces)
-    assert type(policy.act(np.zeros(2))) is type(spaces[1].sample())
-
-
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])  # the last is too large for float32
 @pytest.mark.parametrize("where", ["reward", "observation", "first observation"])
@@ -252,7 +245,7 @@ def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_p
         monkeypatch.setattr(Echo, "reset", lambda self, **more: (np.full(2, value), reset(self, **more)[1]))
     else:
         monkeypatch.setattr(Echo, "step", bad_step)
-    shown = r"(1\.?e\+39|inf)" if value == 1e39 else value
+    shown = r"(1e\+39|inf)" if value == 1e39 else value
     with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{shown}.*not all finite"):
         train(tmp_path / "run", **SHORT, **IDS)
 
