@@ -178,7 +178,7 @@ def empty_replay(capacity, columns, device):
 
 
 def episode_seed(*key):
-    """A 32-bit seed for one episode from integers such as (seed, env index, episode number)."""
+    """A 32-bit seed from integers: (seed, env index, episode number) for an episode, (seed, rank) for a process."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
@@ -346,7 +346,7 @@ class SeededEpisodes(gym.Wrapper):
 
 
 class Environments:
-    """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on.
+    """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on (SAC: (K, S)).
 
     `num_episodes` (K,) counts the episodes that have ended in each.
     """
@@ -376,14 +376,14 @@ class Environments:
         self.resumed_exactly = saved.get("fingerprint", fingerprint) == fingerprint
 
     def step_async(self, actions):
-        """Starts a step with actions (K, …)."""
+        """Takes actions (K, …). Workers begin the step at once; without them `step_wait` does it."""
         self.actions = actions
         if self.in_workers:
             self.vector.step_async(actions)
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). The last are the true ones where an episode has ended and was reset."""
+        observations (K, O). Where an episode ended, the last is its own last one, not the first of the next."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
@@ -687,7 +687,7 @@ class Run:
         self.print(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
     def evaluate(self, step, env_steps, policy):
-        """Plays the evaluation episodes with `policy` (None: random actions) and logs how they went, once a step.
+        """Plays the evaluation episodes with `policy` (None: random actions) and logs them, unless this step is logged.
 
         The best policy so far is saved. A stop request ends this early; the resumed run does it again.
         """

@@ -7,15 +7,15 @@
     python dqn_cartpole.py --tutorial                         # the tutorial's own choices, which are less stable
     torchrun --nproc-per-node 2 dqn_cartpole.py               # two processes, one agent
 
-The Q-network estimates Q(s, a), the sum of the rewards that follow action a in state s. Each later reward counts γ
-times as much as the one before. Each update moves Q(s, a) towards a target, r + γ max Q(s', ·): r is the reward, s' the
-next state, and the maximum is over all actions there. A slow copy of the Q-network, the target network, computes that
-maximum, so that the target moves slowly. Advantage learning lowers the target of every action but the best. The policy
-takes the action of the largest Q. While it collects data, some actions are random: so it explores.
+The Q-network estimates Q(s, a): the sum of the rewards after action a in state s, with the best actions from then on.
+Each later reward counts γ times as much as the one before. Each update moves Q(s, a) towards a target,
+r + γ max Q(s', ·): r is the reward, s' the next state, and the maximum is over all actions there. A slow copy of the
+Q-network, the target network, computes that maximum, so that the target moves slowly. Advantage learning lowers the
+target of every action but the best. The policy takes the action of the largest Q. While it collects data, some actions
+are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
-through deep reinforcement learning" (https://doi.org/10.1038/nature14236). Every default is theirs but those marked
-"ours" in `Config`. README gives the reasons.
+through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks "ours", README says why.
 """
 
 import copy
@@ -52,12 +52,12 @@ class Config:
     batch_size: PositiveInt = 64  # transitions per update, over all processes
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
-    learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): updates until the learning rate is half
+    learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): rate × 1 / (1 + (updates / this)²)
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): the network's output 0 means the worth of an endless episode
+    value_unit: bool = True  # ours (theirs: no): Q = w + |w| × output, where w is an endless episode's worth
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -108,8 +108,9 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds over 1000 times as wide as the observations (N, O), which would all be scaled to 0."""
-        ranks.average([largest := (observations - self.center).abs().amax(0)])  # in place, over the processes
+        """Drops bounds that are over 1000 times as wide as the observations (N, O). CartPole has none."""
+        largest = (observations - self.center).abs().amax(0)
+        ranks.average([largest])  # in place, over the processes
         beyond = self.half_range > 1000 * largest
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
@@ -118,21 +119,18 @@ class ObservationScaling(nn.Module):
 
 
 class QNetwork(nn.Module):
-    """Q(s, ·), the estimated return of every action.
+    """One output for each action. Q is offset + scale × output: see `DQNAgent.q_values`.
 
     It starts as the tutorial's. ReLU layers: weights from a normal distribution of variance 2 / inputs, truncated at
     two standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
     """
-
-    # The standard deviation of a standard normal truncated at ±2. We divide by it, as Keras does.
-    TRUNCATED_STD = 0.87962566103423978
 
     def __init__(self, observation_size, num_actions, hidden_layers):
         super().__init__()
         layers, inputs = [], observation_size
         for units in hidden_layers:
             layers += [linear := nn.Linear(inputs, units), nn.ReLU(inplace=True)]
-            std = math.sqrt(2 / inputs) / self.TRUNCATED_STD
+            std = math.sqrt(2 / inputs) / 0.87962566103423978  # as in Keras: the std of a standard normal cut at ±2
             nn.init.trunc_normal_(linear.weight, 0, std, -2 * std, 2 * std)
             nn.init.zeros_(linear.bias)
             inputs = units
@@ -156,7 +154,7 @@ class Policy(nn.Module):
 
     def forward(self, observation):
         """Actions (batch,) for raw observations (batch, *observation shape)."""
-        return self.q_network(self.scaling(observation.flatten(1))).argmax(1)
+        return self.q_network(self.scaling(observation.flatten(1))).argmax(1)  # the largest output has the largest Q
 
     @torch.inference_mode()
     def act(self, observation):
@@ -195,7 +193,7 @@ class ReplayBuffer:
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
 
     def observations_and_rewards(self):
-        """All that is stored of these: (size, O), (size,)."""
+        """All that are stored: (size, O), (size,)."""
         observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return observations, rewards.squeeze(1)
 
@@ -234,7 +232,7 @@ class DQNAgent(nn.Module):
         self.policy = Policy(config, observation_space, action_space)
         self.scaling, self.q_network = self.policy.scaling, self.policy.q_network
         self.target_network = copy.deepcopy(self.q_network).requires_grad_(False)
-        # Q is offset + scale × the network's output: at first, and in the tutorial, the output itself.
+        # Q = offset + scale × output. With --value-unit `fit_scaling` sets these two.
         self.register_buffer("value_offset", torch.tensor(0.0))
         self.register_buffer("value_scale", torch.tensor(1.0))
         self.to(device)
@@ -267,7 +265,7 @@ class DQNAgent(nn.Module):
         return np.where(exploring, self.random_actions(len(greedy)), greedy)
 
     def q_values(self, network, observations):
-        """Q(s, ·) by a network: (B, A), for scaled observations (B, O). Offset and scale keep the order of actions."""
+        """Q(s, ·) by a network: (B, A), for scaled observations (B, O)."""
         return self.value_offset + self.value_scale * network(observations)
 
     def update(self, batch, step):
@@ -277,20 +275,20 @@ class DQNAgent(nn.Module):
         here would make the CPU wait for the GPU.
         """
         config = self.config
+        if config.learning_rate_decay:  # ours: lr / (1 + (step / decay)²)
+            self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
         s, next_s = self.scaling(s), self.scaling(next_s)  # ours
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·), the target network's: (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # r + γ (1 − terminated) max Q̄(s', ·): (B,)
-            if config.advantage_learning:  # ours: y − weight × (max Q̄(s, ·) − Q̄(s, a)), so worse actions fall further
+            if config.advantage_learning:  # ours: y − this × (max Q̄(s, ·) − Q̄(s, a)), so worse actions fall further
                 y -= config.advantage_learning * gap_to_best(self.q_values(self.target_network, s), a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
         loss = F.mse_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
         loss.backward()
         self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])  # over the processes
-        if config.learning_rate_decay:  # ours: lr / (1 + (step / decay)²)
-            self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         self.optimizer.step()
 
         with torch.no_grad():  # the target network's weights: θ̄ ← θ̄ + τ (θ − θ̄)
@@ -322,8 +320,7 @@ def train(config):
     """Trains as `config` says and returns the run directory's path.
 
     Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
-    stay. A resumed run equals an uninterrupted one: the checkpoint holds the agent, the replay, the random generators,
-    and the seeds and actions of the running episodes. The resumed run plays these again.
+    stay. A resumed run equals an uninterrupted one: `common.SeededEpisodes` plays the running episodes again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
@@ -333,25 +330,25 @@ def train(config):
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
-        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
+        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # other actions and batches on each
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
-        # Random actions first. The scales are fitted to what they lead to.
+        # Random actions first. The scales are fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())
             env_steps += config.num_envs * run.ranks.world_size
             if env_steps >= config.initial_collect_steps:
                 agent.fit_scaling(*buffer.observations_and_rewards())
-        while step < config.num_iterations and not run.stopped:
+        while step < config.num_iterations and not run.stopped:  # stop_requested sets run.stopped
             if step % config.eval_interval == 0:
                 run.evaluate(step, env_steps, agent.policy)
             if run.stop_requested(step):
                 break
 
-            # One step each time, until all environments together have done `due` steps. The next update follows.
+            # One pass is one environment step. An update follows once `due` steps are done: by default in every pass.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.act(envs.observations))

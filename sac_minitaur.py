@@ -7,14 +7,14 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
+The actor π samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
 earns much, yet stays as random as it can, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until
-the entropy has a given value. Actor and critics learn from the smaller of the two estimates of Q, because an actor that
-maximizes one estimate exploits its errors.
+the entropy has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'). Actor
+and critics use the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its errors.
+In the paper slow copies of the critics, the target critics, compute y. By default batch normalization replaces them.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
-Algorithms and Applications" (https://arxiv.org/abs/1812.05905). Every default is theirs but those marked "ours" in
-`Config`. README gives the reasons.
+Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
 """
 
 import copy
@@ -60,7 +60,7 @@ class Config:
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
-    mean_action_episodes: bool = True  # ours (theirs: no): collect every second episode with the evaluated policy
+    mean_action_episodes: bool = True  # ours (theirs: no): every second episode is collected by the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each dimension of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
@@ -115,7 +115,7 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
 
 
 class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O of S numbers."""
+    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O of S numbers: the critics see all."""
 
     def __init__(self, observation_size, action_size, hidden_layers):
         super().__init__()
@@ -136,7 +136,7 @@ class Actor(nn.Module):
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
         u = mean + log_std.exp() * noise
-        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # the Gaussian's density N(u)
         log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
         return u.tanh(), (log_normal - log_determinant).sum(-1)
 
@@ -206,7 +206,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy arrays (K, S), (K, *action shape), (K,). A full buffer overwrites its oldest."""
+        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full buffer overwrites."""
         actions = actions.reshape(len(actions), -1)
         columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
@@ -277,7 +277,7 @@ class SACAgent(nn.Module):
         self.config, self.device, self.ranks, self.action_shape = config, device, ranks, action_space.shape
         observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
-        self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))
+        self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_reward_scale
         self.actor = Actor(observation_size, action_size, config.actor_layers)
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
         # With batch normalization there are no target critics (CrossQ).
@@ -302,7 +302,7 @@ class SACAgent(nn.Module):
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     def fit_reward_scale(self, rewards):
-        """Divides the scale by the standard deviation of the rewards (N,) of this rank, averaged over the ranks."""
+        """Divides the scale by the standard deviation of all ranks' rewards. Those of this rank are (N,)."""
         if self.config.reward_scaling:
             mean = rewards.mean()
             self.ranks.average([mean])  # in place, over the processes
@@ -339,29 +339,30 @@ class SACAgent(nn.Module):
         # The critics: Q(s, a) moves to y = r + γ (1 − terminated) (min Q(s', a') − α log π(a'|s')), a' ~ π(·|s').
         with torch.no_grad():
             next_a, next_log_probs = self.actor.sample(next_s)  # (B, A), (B,)
-        if self.target_critics:
+        if not config.critic_batch_norm:  # as in the paper
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # One pass, as in CrossQ: batch norm takes one mean and variance over (s, a) and (s', a'). No gradient
+            # Ours: one pass, as in CrossQ. Batch norm takes one mean and variance over (s, a) and (s', a'). No gradient
             # reaches next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
-        loss_q = critic_loss(q, y, config.critic_loss_weight)  # w Σ mean (Q − y)²
-        self._step(self.critic_optimizer, loss_q, self.critics.buffers())
+        loss_q = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
+        self._descend(self.critic_optimizer, loss_q, self.critics.buffers())
 
         # The actor: α log π(a|s) − min Q(s, a) falls, with a ~ π(·|s). α falls while the entropy is above its target.
+        # α is detached in the actor's loss, log π in α's: so their sum moves each by its own loss.
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-        self._step(self.actor_optimizer, loss_pi + loss_alpha)
+        self._descend(self.actor_optimizer, loss_pi + loss_alpha)
 
-        # Their weights: θ̄ ← θ̄ + τ (θ − θ̄)
+        # The policy's actor and the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
         follow(self.policy.actor, self.actor, config.averaged_actor_tau)
-        if self.target_critics:
+        if not config.critic_batch_norm:
             follow(self.target_critics, self.critics, config.target_update_tau)
         return {
             "critic_loss": loss_q.detach(),
@@ -372,7 +373,7 @@ class SACAgent(nn.Module):
             "mean_q": q.detach().mean(),
         }
 
-    def _step(self, optimizer, loss, running_statistics=()):
+    def _descend(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         optimizer.zero_grad()
         loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
@@ -437,8 +438,7 @@ def train(config):
     """Trains as `config` says and returns the run directory's path.
 
     Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
-    stay. A resumed run equals an uninterrupted one: the checkpoint holds the agent, the replay, the random generators,
-    and the seeds and actions of the running episodes. The resumed run plays these again.
+    stay. A resumed run equals an uninterrupted one: `common.SeededEpisodes` plays the running episodes again.
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:
@@ -448,25 +448,26 @@ def train(config):
         agent = SACAgent(config, observation_space, action_space, envs.observation_size, run.device, run.ranks)
         sizes = envs.observation_size, math.prod(action_space.shape)
         buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
-        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # different actions and batches
+        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # other actions and batches on each
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
-        # Random actions first. The scale of the rewards is fitted to what they earn.
+        # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())
             env_steps += config.num_envs * run.ranks.world_size
             if env_steps >= config.initial_collect_steps:
                 agent.fit_reward_scale(buffer.rewards())
-        while step < config.num_iterations and not run.stopped:
+        while step < config.num_iterations and not run.stopped:  # stop_requested sets run.stopped
             if step % config.eval_interval == 0:
                 run.evaluate(step, env_steps, agent.policy)
             if run.stop_requested(step):
                 break
 
-            # One step each time, until all environments together have done `due`. The physics runs beside the update.
+            # One pass is one environment step. An update follows once `due` steps are done: by default in every pass.
+            # The physics runs beside the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
             if collecting:
