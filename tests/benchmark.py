@@ -1,6 +1,6 @@
-"""Measures speed: environment step, update, training, the whole job and DQN, in turn, and prints medians and ratios.
+"""Measures speed: environment step, update, training, the whole job and DQN, in turn. Prints medians and ratios as CSV.
 
-    python tests/benchmark.py                  # 15 minutes, 30 with the peers; nothing else should run on the machine
+    python tests/benchmark.py | tee speed.csv  # 15 minutes, 30 with the peers; nothing else should run on the machine
     pip install stable-baselines3 sbx-rl       # optional: compares training with theirs where they are installed
 
 Every figure is the median of `REPEATS` rounds in which all the candidates are measured one after the other, so that a
@@ -191,7 +191,10 @@ def dqn_candidates():
 
 def main():
     common.keep_freed_memory()
-    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch", torch.__version__)
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch"
+    print(machine, torch.__version__, file=sys.stderr)
+    table = csv.writer(sys.stdout, lineterminator="\n")
+    table.writerow(("measured", "candidate", "milliseconds", "ratio"))
     for title, candidates in (
         ("Minitaur, one step", environment_candidates()),
         ("SAC update, batch 256", update_candidates()),
@@ -202,10 +205,10 @@ def main():
         ("DQN, the default command but for the videos", dqn_candidates()),
     ):
         result = medians(dict(candidates))
-        print(f"\n{title}")
         first = next(iter(result.values()))
         for name, time_ in result.items():
-            print(f"  {name:32} {time_:10.2f} ms  × {time_ / first:.2f}", flush=True)
+            table.writerow((title, name, f"{time_:.2f}", f"{time_ / first:.2f}"))
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":
