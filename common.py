@@ -248,6 +248,7 @@ def find_task(config, action_space):
     name = f"--env-id {config.env_id}"
     if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
         raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
+    here = os.getcwd()
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
             observations, actions = env.observation_space, env.action_space
@@ -256,6 +257,8 @@ def find_task(config, action_space):
             task = dataclasses.replace(gym.registry[env.spec.id], max_episode_steps=limit)
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
+    finally:
+        os.chdir(here)  # a simulator may go to its own files
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
     fits = isinstance(actions, action_space)
@@ -502,6 +505,7 @@ class Run:
         # To the microsecond, for runs that are started at once.
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
         self.path = config.resume or config.run_dir or Path("runs") / name
+        self.directory = self.path.absolute()  # a task may change the current one
         # What the run has found; a snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
@@ -557,10 +561,11 @@ class Run:
             reason = "a worker process died" if died else "lost another process: " * lost + first_line(error)
             raise RunError(f"{reason}; {self._how_to_continue()}") from error
         if isinstance(error, TaskError):
+            error.__cause__ = None  # the pool's: the same traceback once more
             self.print(self._how_to_continue())
 
     def _how_to_continue(self):
-        if not (self.path / "checkpoint.pt").exists():
+        if not (self.directory / "checkpoint.pt").exists():
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
@@ -617,23 +622,23 @@ class Run:
         from torch.utils.tensorboard import SummaryWriter  # takes a second
 
         try:
-            str(self.path).encode()  # TensorBoard takes no other names
-            self.path.mkdir(parents=True, exist_ok=True)
+            str(self.directory).encode()  # TensorBoard takes no other names
+            self.directory.mkdir(parents=True, exist_ok=True)
             if self.config.resume is None:
-                if any(self.path.iterdir()):
+                if any(self.directory.iterdir()):
                     raise FileExistsError(0, "not empty: name a new one, or continue it with --resume")
-                (self.path / "config.json").touch(exist_ok=False)  # fails for the second of two runs started at once
+                (self.directory / "config.json").touch(exist_ok=False)  # fails for the second of two at once
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", error)
             raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
         text = json.dumps(plain_config(self.config), indent=2) + "\n"
-        write_atomically(self.path / "config.json", lambda file: file.write(text.encode()))
-        write_atomically(self.path / ".owner", lambda file: file.write(self.owner))
+        write_atomically(self.directory / "config.json", lambda file: file.write(text.encode()))
+        write_atomically(self.directory / ".owner", lambda file: file.write(self.owner))
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
-            for path in self.path.glob(name):
+            for path in self.directory.glob(name):
                 path.unlink(missing_ok=True)  # the run may still go on in another process
         self.stack.enter_context(contextlib.suppress(OSError))  # of the writer's end: the same full disk again
-        self.summary_writer = self.stack.enter_context(SummaryWriter(self.path))
+        self.summary_writer = self.stack.enter_context(SummaryWriter(self.directory))
         for table, rows in self.tables.items():
             self._write_rows(table, rows)
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
@@ -723,8 +728,7 @@ class Run:
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
     def _film(self, parts, name, *more):
-        path = (self.path / name).absolute()  # a task may change the worker's directory
-        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], path, *more)])[0]
+        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], self.directory / name, *more)])[0]
 
     def save(self, step, env_steps, agent, buffer, environments):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
@@ -748,9 +752,9 @@ class Run:
 
     def _write(self, name, write):
         try:
-            if (self.path / ".owner").read_bytes() != self.owner:
+            if (self.directory / ".owner").read_bytes() != self.owner:
                 raise FileNotFoundError
-            write_atomically(self.path / name, write)
+            write_atomically(self.directory / name, write)
         except FileNotFoundError:
             raise RunError(f"another process continues the run in {self.path}, or it was removed") from None
 
@@ -764,7 +768,7 @@ class Run:
         self.progress.close()
         title = f"{self.config.env_id}, seed {self.config.seed}"
         with or_warn("learning_curve.png", self.print):
-            plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
+            plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
         if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(policy).cpu(), {}
@@ -776,16 +780,16 @@ class Run:
                 films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
                 films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
         with or_warn("exported policy", self.print):
-            export_policy(self.path / "policy.pt2", policy, observation_space.shape)
+            export_policy(self.directory / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.found["best"][1])
-            export_policy(self.path / "best_policy.pt2", policy, observation_space.shape)
+            export_policy(self.directory / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
             with or_warn(name, self.print):
                 while futures.wait([recording], 0.1).not_done:
                     if self.stopping:
                         return self.print(f"stopped while filming; {self._how_to_continue()}")
                 recording.result()
-        files = ", ".join(sorted(path.name for path in self.path.iterdir() if not path.name.startswith(".")))
+        files = ", ".join(sorted(path.name for path in self.directory.iterdir() if not path.name.startswith(".")))
         self.print(f"finished; {self.path} holds {files}")
 
 
@@ -821,7 +825,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
         policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
     except RuntimeError:
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
-    seeds = evaluation_seeds(config)
+    seeds, video = evaluation_seeds(config), config.evaluate.with_suffix(".mp4").absolute()
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
     try:
         print(f"{config.evaluate}: {text}", flush=True)
@@ -829,8 +833,8 @@ def evaluate_policy(config, script, policy, task, evaluate):
         raise RunError(first_line(error)) from None
     if config.video:
         with or_warn("video", print):
-            film([(policy, None, None)], task, seeds[0], path := config.evaluate.with_suffix(".mp4"))
-            print(f"filmed one episode: {path}")
+            film([(policy, None, None)], task, seeds[0], video)
+            print(f"filmed one episode: {video}")
 
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):
@@ -894,6 +898,7 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
                     observation, _, terminated, truncated, _ = env.step(action)
                     done, step = terminated or truncated, step + 1
                 video.append_data(frame(caption))
+        imageio.get_reader(file.name).close()  # raises where the disk was full, of which the writer says nothing
 
     with gym.make(task, render_mode="rgb_array") as env:
         write_atomically(path, write)

@@ -108,10 +108,10 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds that are over 1000 times as wide as the observations (N, O). CartPole has none."""
+        """Drops bounds that are over 200 times as wide as the observations (N, O). CartPole has none."""
         largest = (observations - self.center).abs().amax(0)
         ranks.average([largest])  # in place, over the processes
-        beyond = self.half_range > 1000 * largest
+        beyond = self.half_range > 200 * largest
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):

@@ -108,12 +108,25 @@ def test_scaling_maps_bounds_to_one():
     observations = torch.tensor([[2.0, -4, 3, 3, 3, 5], [6, 4, -7, -7, -7, 5], [4, 1, 0, 0, 0, 5]])
     scaled = [[-1.0, -1, 3, 3, 3, 5], [1, 1, -7, -7, -7, 5], [0, 0.25, 0, 0, 0, 5]]
     assert scaling(observations).tolist() == scaled
-    # Bounds that nobody reaches are none, those within a thousand times of the data are.
-    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(np.float32([-1e6, -100]), np.float32([1e6, 100])))
+    # Bounds that nobody reaches are none, those within two hundred times of the data are.
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(np.float32([-1e6, -20]), np.float32([1e6, 20])))
     scaling.fit(torch.tensor([[0.3, 0.2], [-0.1, -0.1]]), common.Ranks())
-    assert scaling(torch.tensor([2.0, 50.0])).tolist() == [2.0, 0.5]
+    assert scaling(torch.tensor([2.0, 10.0])).tolist() == [2.0, 0.5]
     unscaled = make_agent(observation_scaling=False)
     assert torch.equal(unscaled.scaling(observations), observations)
+
+
+@pytest.mark.parametrize("bound", [1e3, 1e6])
+def test_bounds_that_cartpole_does_not_reach_are_none(bound):
+    with gym.make("CartPole-v0") as env:
+        env.action_space.seed(0)
+        observations = [env.reset(seed=0)[0]]
+        while len(observations) < 100:
+            observation, _, terminated, *_ = env.step(env.action_space.sample())
+            observations.append(env.reset()[0] if terminated else observation)
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(-bound, bound, (4,)))
+    scaling.fit(observations := torch.tensor(np.array(observations)), common.Ranks())
+    assert torch.equal(scaling(observations), observations)
 
 
 def test_initialization():

@@ -345,7 +345,9 @@ def ignore_hangup(module):
     before_update(module, 50, lambda: os.kill(os.getpid(), signal.SIGHUP))
 
 
-@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams, ignore_hangup])
+@pytest.mark.parametrize(
+    "hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams, ignore_hangup]
+)
 def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
@@ -548,6 +550,16 @@ def test_a_film_that_fails_leaves_nothing(tmp_path):
     with pytest.raises(ValueError):
         film(tmp_path / "film.mp4", failing=True)
     assert Blinking.closed == closed + 1 and not any(tmp_path.iterdir())
+
+
+def test_a_film_that_the_disk_has_no_room_for_leaves_nothing(small_disk, monkeypatch):
+    noise = np.random.default_rng(0).integers(256, size=(256, 256, 3), dtype=np.uint8)
+    monkeypatch.setattr(Blinking, "render", lambda self: noise)
+    fill(small_disk / "other people's")
+    os.truncate(small_disk / "other people's", (small_disk / "other people's").stat().st_size - 4096)
+    with pytest.raises(Exception):
+        film(small_disk / "film.mp4")
+    assert [path.name for path in small_disk.iterdir()] == ["other people's"]
 
 
 def test_failing_film_costs_a_line_only(script, tmp_path):  # noqa: F811

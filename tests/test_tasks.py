@@ -77,6 +77,24 @@ class Starts(Echo):
         self.program.wait()
 
 
+class Moves(gym.Wrapper):
+    """Goes to a directory of its own, where its files lie, at its start or at a step."""
+
+    def __init__(self, env, path, steps):
+        super().__init__(env)
+        self.path, self.steps = path, steps
+        self._count()
+
+    def _count(self):
+        if self.steps == 0:
+            os.chdir(self.path)
+        self.steps -= 1
+
+    def step(self, action):
+        self._count()
+        return self.env.step(action)
+
+
 class TwoArguments(Exception):
     """It cannot be made anew from its message, as pickle would."""
 
@@ -265,6 +283,7 @@ def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, regi
     with pytest.raises(common.TaskError) as caught:
         train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
     text = str(caught.value)
+    assert caught.value.__cause__ is None  # which would show it a second time
     assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
     assert ("--resume" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
 
@@ -306,6 +325,27 @@ def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
     path, _ = train(tmp_path / "run", **SHORT, **IDS)
     assert signal.getsignal(signal.SIGINT) == handler and os.environ["MPLBACKEND"] == "agg"
     assert (path / "learning_curve.png").exists()
+
+
+@pytest.mark.parametrize("steps", [0, 50])
+def test_a_task_that_changes_the_directory(steps, monkeypatch, tmp_path):
+    """The run lies where the user asked, and the film."""
+
+    def make(render_mode=None):
+        return Moves(gym.make("Pendulum-v1", render_mode=render_mode), tmp_path / "assets", steps)
+
+    (tmp_path / "assets").mkdir()
+    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make, max_episode_steps=20))
+    begin = common.Environments.__init__
+    monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=False))
+    monkeypatch.chdir(tmp_path)
+    sac_minitaur.train(Config(**TINY | SHORT | {"env_id": "Mine-v0", "run_dir": "run", "video": True}))
+    assert Path.cwd() == tmp_path / "assets"
+    monkeypatch.chdir(tmp_path)
+    assert main(monkeypatch, "--evaluate", "run/policy.pt") == 0
+    files = {path.name for path in (tmp_path / "run").iterdir()}
+    assert files > {"checkpoint.pt", "learning_curve.png", "policy.pt2", "trained_agent.mp4", "policy.mp4"}
+    assert not any((tmp_path / "assets").iterdir())
 
 
 def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
