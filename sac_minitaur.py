@@ -136,7 +136,7 @@ class Actor(nn.Module):
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
         u = mean + log_std.exp() * noise
-        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # the Gaussian's density N(u)
+        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # log N(u)
         log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
         return u.tanh(), (log_normal - log_determinant).sum(-1)
 
@@ -206,7 +206,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full buffer overwrites."""
+        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). When full, over the oldest."""
         actions = actions.reshape(len(actions), -1)
         columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
@@ -354,7 +354,7 @@ class SACAgent(nn.Module):
         self._descend(self.critic_optimizer, loss_q, self.critics.buffers())
 
         # The actor: α log π(a|s) − min Q(s, a) falls, with a ~ π(·|s). α falls while the entropy is above its target.
-        # α is detached in the actor's loss, log π in α's: so their sum moves each by its own loss.
+        # The actor's loss takes α as a number, α's loss log π: each moves its own parameters only.
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
@@ -448,7 +448,7 @@ def train(config):
         agent = SACAgent(config, observation_space, action_space, envs.observation_size, run.device, run.ranks)
         sizes = envs.observation_size, math.prod(action_space.shape)
         buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
-        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # other actions and batches on each
+        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
             run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
