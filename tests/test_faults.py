@@ -345,9 +345,7 @@ def ignore_hangup(module):
     before_update(module, 50, lambda: os.kill(os.getpid(), signal.SIGHUP))
 
 
-@pytest.mark.parametrize(
-    "hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams, ignore_hangup]
-)
+@pytest.mark.parametrize("hook", [lose_the_reader, close_stdout, replace_stderr, have_no_streams, ignore_hangup])
 def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
