@@ -70,7 +70,7 @@ class Config:
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Parallel = 1  # CPU threads of the update: 1 is best on two cores, 4 on sixteen
+    num_threads: common.Parallel = 1  # CPU threads of the update: 1 is enough on two cores, 4 on sixteen
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
