@@ -103,7 +103,7 @@ Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
 def with_tutorial_values(given, tutorial):
-    """What `Config` is given, with the `tutorial`'s values for what is not given where `tutorial` is."""
+    """What `Config` is given. With `tutorial=True` the rest has the values in `tutorial`."""
     values = given.kwargs or {}
     return ArgsKwargs(given.args, tutorial | values) if values.get("tutorial") else given
 

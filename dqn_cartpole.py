@@ -11,8 +11,8 @@ The Q-network estimates Q(s, a): the sum of the rewards after action a in state 
 Each later reward counts γ times as much as the one before. Each update moves Q(s, a) towards a target,
 r + γ max Q(s', ·): r is the reward, s' the next state, and the maximum is over all actions there. A slow copy of the
 Q-network, the target network, computes that maximum, so that the target moves slowly. Advantage learning lowers the
-target of every action but the best. The policy takes the action of the largest Q. While it collects data, some actions
-are random: so it explores.
+target of every action but the best, which stays the best. The policy takes the action of the largest Q. While it
+collects data, some actions are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks "ours", README says why.
@@ -45,7 +45,7 @@ class Config:
     env_id: str = "CartPole-v0"  # a gymnasium task with a Discrete action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 20_000  # gradient updates
-    initial_collect_steps: PositiveInt = 100  # steps with random actions before the first update, over all processes
+    initial_collect_steps: PositiveInt = 100  # random steps before the first update, over environments and processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: common.Parallel = 1  # environments that each process steps at once
     replay_buffer_capacity: PositiveInt = 100_000  # transitions kept by each process
@@ -57,7 +57,7 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): Q = w + |w| × output, where w is an endless episode's worth
+    value_unit: bool = True  # ours (theirs: no): Q = (mean r + mean |r| × output) / (1 − γ), r of the first steps
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -108,7 +108,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds that are over 200 times as wide as the observations (N, O). CartPole has none."""
+        """Drops bounds that are over 200 times as wide as the observations (N, O): none of CartPole's."""
         largest = (observations - self.center).abs().amax(0)
         ranks.average([largest])  # in place, over the processes
         beyond = self.half_range > 200 * largest
@@ -121,8 +121,8 @@ class ObservationScaling(nn.Module):
 class QNetwork(nn.Module):
     """One output for each action. Q is offset + scale × output: see `DQNAgent.q_values`.
 
-    It starts as the tutorial's. ReLU layers: weights from a normal distribution of variance 2 / inputs, truncated at
-    two standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
+    It starts as the tutorial's. ReLU layers: weights of variance 2 / inputs, from a normal distribution cut at two
+    standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
     """
 
     def __init__(self, observation_size, num_actions, hidden_layers):
@@ -193,7 +193,7 @@ class ReplayBuffer:
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
 
     def observations_and_rewards(self):
-        """All that are stored: (size, O), (size,)."""
+        """All that are stored: (N, O), (N,)."""
         observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return observations, rewards.squeeze(1)
 
@@ -222,7 +222,7 @@ def gap_to_best(q, actions):
 class DQNAgent(nn.Module):
     """The Q-network, its slow copy for steady targets, the optimizer, and the greedy policy that is evaluated.
 
-    `ranks` are the processes of torchrun. Where there is one, its `average` does nothing.
+    `ranks.average` takes means over the processes of torchrun. With one process it does nothing.
     """
 
     def __init__(self, config, observation_space, action_space, device, ranks):
@@ -333,7 +333,7 @@ def train(config):
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
+            run.save(step, env_steps, agent, buffer, envs)  # a kill in the first steps can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
         # Random actions first. The scales are fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
@@ -348,7 +348,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # One pass is one environment step. An update follows once `due` steps are done: by default in every pass.
+            # The next update waits for `due` steps. A pass steps every environment, updates, or does both (default).
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.act(envs.observations))

@@ -42,7 +42,7 @@ class Config:
     env_id: str = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 100_000  # gradient updates
-    initial_collect_steps: PositiveInt = 10_000  # steps with random actions before the first update, over all processes
+    initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
     collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
     num_envs: common.Parallel = 1  # environments that each process steps at once, each in a worker process of its own
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
@@ -130,7 +130,7 @@ class Actor(nn.Module):
     def sample(self, observation):
         """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
 
-        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The subtracted term
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). Each summand
         equals 2 (log 2 − u − softplus(−2u)) exactly, and does not round to log 0 where tanh saturates.
         """
         mean, log_std = self(observation)
@@ -149,9 +149,9 @@ class TwinCritics(nn.Module):
         self.q1 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
         self.q2 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
 
-    def forward(self, observation, action):
-        """(2, …) for observations (…, S) and actions (…, A)."""
-        x = torch.cat((observation, action), dim=-1)
+    def forward(self, state, action):
+        """(2, …) for states (…, S) and actions (…, A)."""
+        x = torch.cat((state, action), dim=-1)
         return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
 
 
@@ -222,7 +222,7 @@ class ReplayBuffer:
         return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
 
     def rewards(self):
-        """All that are stored: (size,)."""
+        """All that are stored: (N,)."""
         _, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return rewards.squeeze(1)
 
@@ -269,22 +269,21 @@ class SACAgent(nn.Module):
 
     The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: these O and the
     privileged ones. The policy's actor is a running average of the actor, because a single snapshot may be bad.
-    `ranks` are the processes of torchrun. Where there is one, its `average` does nothing.
+    `ranks.average` takes means over the processes of torchrun. With one process it does nothing.
     """
 
     def __init__(self, config, observation_space, action_space, state_size, device, ranks):
         super().__init__()
         self.config, self.device, self.ranks, self.action_shape = config, device, ranks, action_space.shape
-        observation_size, action_size = math.prod(observation_space.shape), math.prod(action_space.shape)
+        action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
         self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_reward_scale
-        self.actor = Actor(observation_size, action_size, config.actor_layers)
+        self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
+        self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
         # With batch normalization there are no target critics (CrossQ).
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(config.initial_log_alpha))
-        self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
-        self.policy.actor.load_state_dict(self.actor.state_dict())
         self.to(device)
 
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
@@ -354,7 +353,7 @@ class SACAgent(nn.Module):
         self._descend(self.critic_optimizer, loss_q, self.critics.buffers())
 
         # The actor: α log π(a|s) − min Q(s, a) falls, with a ~ π(·|s). α falls while the entropy is above its target.
-        # The actor's loss takes α as a number, α's loss log π: each moves its own parameters only.
+        # α is constant in the actor's loss, log π in α's loss: each moves its own parameters only.
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
@@ -428,9 +427,8 @@ def make_training_env(task, privileged):
     """
     env = gym.make(task)
     low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
-    if (low != -1).any() or (high != 1).any() or dtype != np.float32:
-        unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
-        env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
+    unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
+    env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
     return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
 
 
@@ -451,7 +449,7 @@ def train(config):
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)  # a kill before the first checkpoint can be resumed too
+            run.save(step, env_steps, agent, buffer, envs)  # a kill in the first steps can be resumed too
         run.evaluate(0, 0, policy=None)  # random actions, for comparison
         # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
@@ -466,7 +464,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # One pass is one environment step. An update follows once `due` steps are done: by default in every pass.
+            # The next update waits for `due` steps. A pass steps every environment, updates, or does both (default).
             # The physics runs beside the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
@@ -657,7 +655,7 @@ class MinitaurBulletEnv(gym.Env):
         simulator, dynamics = self.simulator, self.dynamics
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
         drive = pwm * dynamics.voltage
-        # The robot observes a torque without back-EMF and saturation. The torque that moves it, below, has both.
+        # The robot observes a torque without back-EMF and the iron's saturation. The torque that moves it has both.
         self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(
             -self.MAX_OBSERVED_TORQUE, self.MAX_OBSERVED_TORQUE
         )
