@@ -91,8 +91,6 @@ def first_line(error):
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
-# Configs and the command line
-
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
@@ -121,11 +119,9 @@ def read_command_line(config_class, description, script):
     if source := given.resume or given.evaluate:
         if given.resume:
             saved = read_file(source / "checkpoint.pt", "checkpoint", script)["config"]
-            others = saved.keys() ^ vars(default).keys()
-        else:
-            saved = read_file(source, "policy", script)["config"] | {"video": True}
-            others = saved.keys() - vars(default).keys()  # a policy may be older than a fork's field
-        if others:
+        else:  # a policy may be older than a fork's field
+            saved = vars(default) | read_file(source, "policy", script)["config"] | {"video": True}
+        if others := saved.keys() ^ vars(default).keys():
             raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
         try:
             default = config_class(**saved)
@@ -138,9 +134,6 @@ def read_command_line(config_class, description, script):
 def plain_config(config):
     """The config as a dict of numbers, strings and lists, without the paths of this very run."""
     return to_jsonable_python(vars(config) | {"run_dir": None, "resume": None, "evaluate": None})
-
-
-# Devices, memory and seeds
 
 
 def select_device(name, local_rank=0):
@@ -158,13 +151,13 @@ def select_device(name, local_rank=0):
 
 
 def keep_freed_memory():
-    """Tells glibc to keep what is freed (mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, 256 MB).
+    """Tells glibc to keep what is freed (mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD).
 
     Every update frees and allocates the same tensors. Without this each would be mapped in afresh, page by page.
     """
     with contextlib.suppress(OSError, AttributeError, TypeError):  # no glibc
         libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 256 << 20)
+        libc.mallopt(-3, 32 << 20)  # the most that glibc before 2.35 takes
         libc.mallopt(-1, 256 << 20)
 
 
@@ -177,6 +170,17 @@ def empty_replay(capacity, columns, device):
         raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
 
 
+def replay_state(buffer):
+    """A copy of the filled part of a script's `ReplayBuffer`, for a checkpoint."""
+    return {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
+
+
+def restore_replay(buffer, state):
+    """Fills a new `ReplayBuffer`. Raises RuntimeError when the rows do not fit."""
+    buffer.size, buffer.position = len(state["rows"]), state["position"]
+    buffer.rows[: buffer.size] = state["rows"]
+
+
 def episode_seed(*key):
     """A 32-bit seed from integers: (seed, env index, episode number) for an episode, (seed, rank) for a process."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
@@ -185,9 +189,6 @@ def episode_seed(*key):
 def evaluation_seeds(config):
     """The seeds of the episodes that every evaluation of a run plays."""
     return [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
-
-
-# Several processes that train one agent
 
 
 class Ranks:
@@ -229,14 +230,10 @@ class Ranks:
 
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
-        if self.world_size == 1:
-            return [value]
-        values = [None] * self.world_size if self.rank == 0 else None
-        dist.gather_object(value, values)
+        values = [value] * self.world_size if self.rank == 0 else None
+        if self.world_size > 1:
+            dist.gather_object(value, values)
         return values
-
-
-# Tasks and their worker processes
 
 
 def find_task(config, action_space):
@@ -266,8 +263,9 @@ def find_task(config, action_space):
         needed, fits = "Discrete from 0", fits and actions.start == 0
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        fits = fits and actions.shape and 0 not in actions.shape and actions.dtype.kind == "f"
-        if fits:  # in float32, as the agent computes
+        floats = np.float16, np.float32, np.float64
+        if fits := fits and actions.shape and 0 not in actions.shape and actions.dtype in floats:
+            # In float32, as the agent computes.
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = (widths.isfinite() & (widths > 0)).all()
     if not fits:
@@ -375,8 +373,7 @@ class Environments:
         (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         self.num_episodes = np.array(self.vector.get_attr("episode"))
-        fingerprint = self._fingerprint()
-        self.resumed_exactly = saved.get("fingerprint", fingerprint) == fingerprint
+        self.resumed_exactly = saved.get("fingerprint") in (None, self._fingerprint())
 
     def step_async(self, actions):
         """Takes actions (K, …). Workers begin the step at once; without them `step_wait` does it."""
@@ -420,9 +417,6 @@ class Environments:
             process.join()
             self.vector.closed = True
         self.vector.close()
-
-
-# Files
 
 
 def write_atomically(path, write):
@@ -471,9 +465,6 @@ def export_policy(path, policy, observation_shape):
     write_atomically(path, lambda file: file.write(archive.getvalue()))
 
 
-# Runs
-
-
 def _in_worker(function, file, *arguments):
     with telling_task_errors():
         return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
@@ -510,9 +501,8 @@ class Run:
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
         self.tables = self.found["tables"]
-        self.started = time.monotonic() - self.checkpoint.get("seconds", 0.0)
+        self.started = time.perf_counter() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
-        self.last_logged = time.monotonic(), self.saved_step
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
         self.owner = os.urandom(16)  # in a file, until --resume in another process writes its own
         self.stack = contextlib.ExitStack()
@@ -540,7 +530,8 @@ class Run:
                         self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-                size, context = min(cores, self.config.num_eval_episodes), multiprocessing.get_context(START_METHOD)
+                size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
+                context = multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
@@ -566,7 +557,7 @@ class Run:
 
     def _how_to_continue(self):
         if not (self.directory / "checkpoint.pt").exists():
-            return "there is no checkpoint yet"
+            return "there is no checkpoint yet" if self.writes else "rank 0 has the checkpoint"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
         program = Path(getattr(module, "__file__", f"{self.script}.py")).name
@@ -597,7 +588,7 @@ class Run:
             own = saved["ranks"][self.ranks.rank]
             try:
                 agent.load_state_dict(saved["agent"])
-                buffer.load_state_dict(own["buffer"])
+                restore_replay(buffer, own["buffer"])
             except RuntimeError:
                 raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
@@ -616,7 +607,12 @@ class Run:
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         if not environments.resumed_exactly:
             self.print("warning: an episode went differently when it was played again: this resume is not exact")
-        return self.saved_step, saved.get("env_steps", 0)
+        step, env_steps = self.saved_step, saved.get("env_steps", 0)
+        if not env_steps:  # a kill in the first steps can be resumed too
+            self.save(step, env_steps, agent, buffer, environments)
+        self.evaluate(0, 0, policy=None)  # random actions, for comparison
+        self.last_logged = time.perf_counter(), step
+        return step, env_steps
 
     def _start_files(self):
         from torch.utils.tensorboard import SummaryWriter  # takes a second
@@ -658,7 +654,7 @@ class Run:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would complain at its end
 
     def _log(self, table, step, env_steps, values):
-        seconds = round(time.monotonic() - self.started, 3)
+        seconds = round(time.perf_counter() - self.started, 3)
         self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
         self._write_rows(table, self.tables[table][-1:])
 
@@ -677,15 +673,16 @@ class Run:
     def log_training(self, step, env_steps, environments, metrics):
         """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
 
-        Raises RunError naming the step and the first of the metrics that is not finite.
+        Every `log_interval` updates. Raises RunError naming the step and the first metric that is not finite.
         """
-        if not self.writes:
+        self.progress.update()
+        if not self.writes or step % self.config.log_interval:
             return
         values = dict(zip(metrics, torch.stack(list(metrics.values())).tolist()))  # one wait for a GPU
         for name, value in values.items():
             if not math.isfinite(value):
                 raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
-        now, (then, last_step) = time.monotonic(), self.last_logged
+        now, (then, last_step) = time.perf_counter(), self.last_logged
         self.last_logged, speed = (now, step), (step - last_step) / (now - then)
         self._log("train", step, env_steps, {"steps_per_second": speed} | environments.recent() | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
@@ -736,12 +733,12 @@ class Run:
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        own = {"buffer": buffer.state_dict(), "environments": environments.state_dict(), "random": random}
+        own = {"buffer": replay_state(buffer), "environments": environments.state_dict(), "random": random}
         ranks = self.ranks.gather(own)
         if not self.writes:
             return
         require_finite(agent, step)
-        state = {"step": step, "env_steps": env_steps, "seconds": time.monotonic() - self.started, "ranks": ranks}
+        state = {"step": step, "env_steps": env_steps, "seconds": time.perf_counter() - self.started, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
         self._save("checkpoint.pt", "checkpoint", state | self.found)
@@ -758,11 +755,15 @@ class Run:
         except FileNotFoundError:
             raise RunError(f"another process continues the run in {self.path}, or it was removed") from None
 
-    def finish(self, step, policy, observation_space):
-        """Draws the curve, exports and films the policy, and says where everything lies. What fails costs a line.
+    def finish(self, step, env_steps, agent, buffer, environments, observation_space):
+        """Saves and evaluates once more, draws the curve, exports and films the policy, and says where everything lies.
 
-        After a stop it only draws the curve and says how to continue.
+        What fails costs a line. After a stop it only saves, draws the curve and says how to continue.
         """
+        if step > self.saved_step or self.stopped:
+            self.save(step, env_steps, agent, buffer, environments)
+        if not self.stopped:
+            self.evaluate(step, env_steps, agent.policy)
         if not self.writes:
             return
         self.progress.close()
@@ -771,7 +772,7 @@ class Run:
             plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
         if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
-        policy, films = copy.deepcopy(policy).cpu(), {}
+        policy, films = copy.deepcopy(agent.policy).cpu(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
             learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]

@@ -93,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The network (shapes: B batch, K environments, N stored, O numbers of an observation, A actions)
+# Shapes: B batch, K environments, N stored, O numbers of an observation, A actions
 
 
 class ObservationScaling(nn.Module):
@@ -162,9 +162,6 @@ class Policy(nn.Module):
         return self(torch.from_numpy(np.array(observation, np.float32))[None]).numpy()[0]
 
 
-# The replay buffer
-
-
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
@@ -196,17 +193,6 @@ class ReplayBuffer:
         """All that are stored: (N, O), (N,)."""
         observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return observations, rewards.squeeze(1)
-
-    def state_dict(self):
-        """A copy of the filled part, for a checkpoint."""
-        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position}
-
-    def load_state_dict(self, state):
-        self.size, self.position = len(state["rows"]), state["position"]
-        self.rows[: self.size] = state["rows"].to(self.rows.device)
-
-
-# The agent
 
 
 def td_targets(rewards, terminated, next_q, gamma):
@@ -297,9 +283,6 @@ class DQNAgent(nn.Module):
         return {"loss": loss.detach(), "mean_q": q.detach().mean()}
 
 
-# Evaluation
-
-
 def evaluate(policy, task, seed):
     """Return and length of one episode with the greedy `policy`, or with random actions where it is None."""
     with gym.make(task) as env:
@@ -311,9 +294,6 @@ def evaluate(policy, task, seed):
             observation, reward, terminated, truncated, _ = env.step(action)
             episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
     return episode_return, length
-
-
-# Training
 
 
 def train(config):
@@ -332,9 +312,6 @@ def train(config):
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
-        if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)  # a kill in the first steps can be resumed too
-        run.evaluate(0, 0, policy=None)  # random actions, for comparison
         # Random actions first. The scales are fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
@@ -357,17 +334,11 @@ def train(config):
             if env_steps >= due:
                 metrics = agent.update(buffer.sample(batch_size), step)
                 step += 1
-                run.progress.update()
-                if step % config.log_interval == 0:
-                    run.log_training(step, env_steps, envs, metrics)
+                run.log_training(step, env_steps, envs, metrics)
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
-        if step > run.saved_step or run.stopped:
-            run.save(step, env_steps, agent, buffer, envs)
-        if not run.stopped:
-            run.evaluate(step, env_steps, agent.policy)
-        run.finish(step, agent.policy, observation_space)
+        run.finish(step, env_steps, agent, buffer, envs, observation_space)
         return run.path
 
 

@@ -93,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# The networks (shapes: B batch, K environments, N stored, O numbers observed, S = O + privileged ones, A of an action)
+# Shapes: B batch, K environments, N stored, O numbers observed, S = O and the privileged ones, A of an action
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -190,9 +190,6 @@ def require_finite(actions):
         raise common.RunError("the actor's actions are not finite: learning diverged; a smaller learning rate may help")
 
 
-# The replay buffer
-
-
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
@@ -225,17 +222,6 @@ class ReplayBuffer:
         """All that are stored: (N,)."""
         _, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return rewards.squeeze(1)
-
-    def state_dict(self):
-        """A copy of the filled part, for a checkpoint."""
-        return {"rows": self.rows[: self.size].to("cpu", copy=True), "position": self.position}
-
-    def load_state_dict(self, state):
-        self.size, self.position = len(state["rows"]), state["position"]
-        self.rows[: self.size] = state["rows"].to(self.rows.device)
-
-
-# The agent
 
 
 def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
@@ -289,11 +275,9 @@ class SACAgent(nn.Module):
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, which learn from the same sample of actions.
-        groups = [
-            {"params": list(self.actor.parameters()), "lr": config.actor_learning_rate},
-            {"params": [self.log_alpha], "lr": config.alpha_learning_rate},
-        ]
-        self.actor_optimizer = torch.optim.Adam(groups, **adam)
+        actor = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
+        alpha = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
+        self.actor_optimizer = torch.optim.Adam([actor, alpha], **adam)
         self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
 
     def random_actions(self, count):
@@ -363,14 +347,9 @@ class SACAgent(nn.Module):
         follow(self.policy.actor, self.actor, config.averaged_actor_tau)
         if not config.critic_batch_norm:
             follow(self.target_critics, self.critics, config.target_update_tau)
-        return {
-            "critic_loss": loss_q.detach(),
-            "actor_loss": loss_pi.detach(),
-            "alpha_loss": loss_alpha.detach(),
-            "alpha": alpha,
-            "entropy": -log_probs.detach().mean(),
-            "mean_q": q.detach().mean(),
-        }
+        metrics = {"critic_loss": loss_q, "actor_loss": loss_pi, "alpha_loss": loss_alpha, "alpha": alpha}
+        metrics |= {"entropy": -log_probs.mean(), "mean_q": q.mean()}
+        return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -389,9 +368,6 @@ def follow(average, module, tau):
         mean.lerp_(parameter, tau)
 
 
-# Evaluation
-
-
 def evaluate(policy, task, seed):
     """Return and length of one episode with the deterministic `policy`, or with random actions where it is None."""
     with gym.make(task) as env:
@@ -403,9 +379,6 @@ def evaluate(policy, task, seed):
             observation, reward, terminated, truncated, _ = env.step(action)
             episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
     return episode_return, length
-
-
-# Training
 
 
 class AppendPrivileged(gym.ObservationWrapper):
@@ -448,9 +421,6 @@ def train(config):
         buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
-        if not env_steps:
-            run.save(step, env_steps, agent, buffer, envs)  # a kill in the first steps can be resumed too
-        run.evaluate(0, 0, policy=None)  # random actions, for comparison
         # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
@@ -475,19 +445,13 @@ def train(config):
             if env_steps >= due:
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
-                run.progress.update()
-                if step % config.log_interval == 0:
-                    run.log_training(step, env_steps, envs, metrics)
+                run.log_training(step, env_steps, envs, metrics)
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
-        if step > run.saved_step or run.stopped:
-            run.save(step, env_steps, agent, buffer, envs)
-        if not run.stopped:
-            run.evaluate(step, env_steps, agent.policy)
-        run.finish(step, agent.policy, observation_space)
+        run.finish(step, env_steps, agent, buffer, envs, observation_space)
         return run.path
 
 
@@ -590,9 +554,8 @@ class MinitaurBulletEnv(gym.Env):
         simulator.setTimeStep(self.SUBSTEP_SECONDS)
         simulator.loadURDF("plane.urdf")
         simulator.setGravity(0, 0, -10)
-        self.robot = robot = simulator.loadURDF(
-            "quadruped/minitaur.urdf", (0, 0, 0.2), flags=simulator.URDF_USE_SELF_COLLISION
-        )
+        flags = simulator.URDF_USE_SELF_COLLISION
+        self.robot = robot = simulator.loadURDF("quadruped/minitaur.urdf", (0, 0, 0.2), flags=flags)
         joints = (simulator.getJointInfo(robot, i) for i in range(simulator.getNumJoints(robot)))
         joint = {info[1].decode(): info[0] for info in joints}
         self.motor_joints = [joint[f"motor_{motor}_joint"] for motor in self.MOTORS]
@@ -602,10 +565,9 @@ class MinitaurBulletEnv(gym.Env):
             simulator.resetJointState(robot, knee, direction * self.KNEE_ANGLE)
             for free in (motor, knee):  # pybullet's own velocity motor brakes every joint until it is given no force
                 simulator.setJointMotorControl2(robot, free, simulator.VELOCITY_CONTROL, force=0)
+        pin = simulator.JOINT_POINT2POINT, (0, 0, 0), (0, 0.005, 0.2), (0, 0.01, 0.2)
         for left, right in zip(knee_joints[::2], knee_joints[1::2]):
-            simulator.createConstraint(
-                robot, right, robot, left, simulator.JOINT_POINT2POINT, (0, 0, 0), (0, 0.005, 0.2), (0, 0.01, 0.2)
-            )
+            simulator.createConstraint(robot, right, robot, left, *pin)
 
     def _draw_dynamics(self):
         uniform = self.np_random.uniform
@@ -656,18 +618,15 @@ class MinitaurBulletEnv(gym.Env):
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
         drive = pwm * dynamics.voltage
         # The robot observes a torque without back-EMF and the iron's saturation. The torque that moves it has both.
-        self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(
-            -self.MAX_OBSERVED_TORQUE, self.MAX_OBSERVED_TORQUE
-        )
+        limit = self.MAX_OBSERVED_TORQUE
+        self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(-limit, limit)
         back_emf = (self.TORQUE_CONSTANT + dynamics.viscous_damping) * self.velocity
         current = (drive - back_emf).clip(-self.MAX_NET_VOLTAGE, self.MAX_NET_VOLTAGE) / self.RESISTANCE
         torque = np.interp(np.abs(current), self.CURRENTS, self.TORQUES)
         self.hot_substeps = (self.hot_substeps + 1) * (torque > self.OVERHEAT_TORQUE)
         self.motor_enabled &= self.hot_substeps <= self.OVERHEAT_SUBSTEPS
-        force = np.sign(current) * torque * self.DIRECTION * self.motor_enabled
-        simulator.setJointMotorControlArray(
-            self.robot, self.motor_joints, simulator.TORQUE_CONTROL, forces=force.tolist()
-        )
+        force = (np.sign(current) * torque * self.DIRECTION * self.motor_enabled).tolist()
+        simulator.setJointMotorControlArray(self.robot, self.motor_joints, simulator.TORQUE_CONTROL, forces=force)
         simulator.stepSimulation()
         self._read_motors()
 
@@ -700,9 +659,7 @@ class MinitaurBulletEnv(gym.Env):
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
-    gym.register(
-        id="MinitaurBulletEnv-v0", entry_point=MinitaurBulletEnv, max_episode_steps=1000, reward_threshold=15.0
-    )
+    gym.register("MinitaurBulletEnv-v0", MinitaurBulletEnv, max_episode_steps=1000, reward_threshold=15.0)
 
 
 def main():

@@ -169,7 +169,7 @@ def test_several_environments_fill_the_buffer_across_its_end():
     for i in range(2):
         column = np.arange(3.0) + 3 * i
         buffer.add(column[:, None], np.zeros(3), column, np.zeros(3), column[:, None])
-        saved.append(buffer.state_dict()["rows"])
+        saved.append(common.replay_state(buffer)["rows"])
     assert buffer.rows[:, 0].tolist() == [4, 5, 2, 3]
     assert saved[0][:, 0].tolist() == [0, 1, 2]  # a copy, and a checkpoint does not grow with the capacity
     assert saved[0].untyped_storage().nbytes() == 3 * 5 * 4

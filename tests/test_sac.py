@@ -242,8 +242,8 @@ def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
 def test_replay_buffer_goes_on_from_its_state(stored, position):
     buffer = filled(ReplayBuffer(5, 2, 1, CPU), 0, stored)
     other = ReplayBuffer(5, 2, 1, CPU)
-    state = buffer.state_dict()
-    other.load_state_dict(state)
+    state = common.replay_state(buffer)
+    common.restore_replay(other, state)
     for each in (buffer, other):
         filled(each, stored, 4)
     assert torch.equal(other.rows, buffer.rows) and buffer.size == other.size == 5
@@ -888,6 +888,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
         ("action", gym.spaces.Box(-1e39, 1e39, (2,), np.float64)),
         ("action", gym.spaces.Box(1.0, 1.0 + 1e-12, (2,), np.float64)),  # and here it is none
         ("action", gym.spaces.Box(-1, 1, ())),
+        ("action", gym.spaces.Box(-1, 1, (2,), np.longdouble)),
         ("observation", gym.spaces.Box(-1, 1, ())),
         ("observation", gym.spaces.Discrete(3)),
     ],
