@@ -578,7 +578,7 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint, if any, begins the files, and says what is trained, on what, and where.
+        """Restores the checkpoint or saves a first one, begins the files, and plays the episodes with random actions.
 
         Returns the gradient updates and the environment steps done so far. There is no directory before this, when all
         that the user gave has been found usable.
@@ -598,8 +598,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
-        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
+        bar = {"disable": None if self.writes and sys.stderr else True}  # None: where stderr is a terminal
+        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", **bar)
         self.stack.enter_context(self.progress)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")

@@ -416,9 +416,9 @@ def train(config):
         batch_size = run.ranks.batch_share(config)
         envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
         torch.manual_seed(config.seed)  # the same networks on every rank
-        agent = SACAgent(config, observation_space, action_space, envs.observation_size, run.device, run.ranks)
-        sizes = envs.observation_size, math.prod(action_space.shape)
-        buffer = ReplayBuffer(config.replay_buffer_capacity, *sizes, run.device)
+        state_size = envs.observation_size  # S, with the privileged numbers
+        agent = SACAgent(config, observation_space, action_space, state_size, run.device, run.ranks)
+        buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
         torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
