@@ -69,6 +69,7 @@ def run_main(main):
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+    os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     # TensorBoard's thread would print a traceback about a full disk, which the main thread reports anyway.
     hook = threading.excepthook
     threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)

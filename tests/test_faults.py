@@ -129,6 +129,11 @@ def test_checkpoint_of_another_version(script, copy):  # noqa: F811
     assert "no good" in (message := refusal(script, "--resume", copy)) and "gamma" in message
 
 
+def test_a_value_out_of_range_is_told_without_an_address(script, tmp_path):  # noqa: F811
+    process = Process(script, ["--gamma", "2"], tmp_path / "output")
+    assert process.wait() == 2 and "less than or equal to 1" in process.stderr and "https" not in process.stderr
+
+
 def test_resume_and_evaluate_exclude_each_other(script, reference):  # noqa: F811
     assert "give one of them" in refusal(script, "--resume", reference, "--evaluate", reference / "policy.pt")
 
