@@ -21,7 +21,7 @@ FIGURES = {
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
-        ("dqn_cartpole_tf2.6", "dqn_cartpole_tf2.11"),
+        ("dqn_cartpole_2021", "dqn_cartpole_2023"),
     ),
 }
 
