@@ -20,9 +20,6 @@ def end(ranks, statuses=None):
     assert [rank.wait() for rank in ranks] == (statuses or [0] * len(ranks)), [rank.stderr for rank in ranks]
 
 
-# Gradients
-
-
 def new_agent(module, ranks):
     """A tiny agent whose critics do not move, so that the actor's gradients are those of the same critics.
 
@@ -87,9 +84,6 @@ def test_averaged_gradients_equal_those_of_the_joined_batch(world_size, tmp_path
             assert all(gradient.abs().max() > 0 for gradient in expected[name])
             for gradient, right in zip(averaged[name], expected[name], strict=True):
                 torch.testing.assert_close(gradient, right, rtol=1e-5, atol=1e-6 * float(right.abs().max()))
-
-
-# Whole runs
 
 
 def save_agent_at(module, directory, count):
@@ -223,9 +217,6 @@ def test_first_steps_that_are_too_few_for_two_processes(tmp_path):
     end(ranks, [2, 2])
     assert ranks[0].stderr == "error: --batch-size 258 is more than the 256 transitions stored at first\n"
     assert not (tmp_path / "run").exists()
-
-
-# torchrun itself
 
 
 def test_torchrun_ends_when_a_rank_is_killed(tmp_path):

@@ -63,9 +63,6 @@ def checkpoint(path):
     return common.read_file(path / "checkpoint.pt", "checkpoint", "dqn_cartpole")
 
 
-# Targets and loss
-
-
 def test_targets_by_hand():
     """Only `terminated` cuts the bootstrap."""
     rewards, next_q = torch.tensor([1.0, 1.0, 2.0]), torch.tensor([[10.0, 20.0], [10.0, 20.0], [-4.0, 8.0]])
@@ -95,9 +92,6 @@ def test_advantage_learning_pushes_values_apart():
     for step in range(400):
         agent.update((torch.ones(16, 4), actions, 1.0 - actions, torch.ones(16), torch.ones(16, 4)), step)
     assert agent.q_network(agent.scaling(torch.ones(4))).tolist() == pytest.approx([1, -1], abs=0.02)
-
-
-# The network
 
 
 def test_scaling_maps_bounds_to_one():
@@ -148,9 +142,6 @@ def test_network_has_the_tutorials_layers():
     assert shapes == [(100, 4), (100,), (50, 100), (50,), (2, 50), (2,)]
 
 
-# The replay buffer
-
-
 def test_buffer_overwrites_the_oldest():
     buffer = ReplayBuffer(5, 2, CPU)
     for i in range(7):
@@ -197,9 +188,6 @@ def test_stored_next_observations_are_the_true_ones(tmp_path):
     # Within an episode one transition's next observation is the next one's observation; after 7 steps comes a reset.
     follows = (next_observations[:-1] == observations[1:]).all(axis=1)
     assert follows.tolist() == [i % 7 != 6 for i in range(len(rows) - 1)]
-
-
-# The agent
 
 
 def test_epsilon_greedy_frequencies():
@@ -338,9 +326,6 @@ def test_updates_on_the_gpu_are_those_of_the_cpu():
     torch.testing.assert_close(agents[1].results, agents[0].results, rtol=1e-3, atol=1e-4)
 
 
-# Training
-
-
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
     """The directory of a tiny run."""
@@ -422,9 +407,6 @@ def test_learns_cartpole(seed, tmp_path):
     returns = [float(row["average_return"]) for row in read_rows(path / "eval.csv")]
     assert max(returns) >= 195, returns
     assert float(read_rows(path / "random.csv")[0]["average_return"]) < 60
-
-
-# The command line
 
 
 def test_imports_without_pybullet():

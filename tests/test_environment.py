@@ -24,9 +24,6 @@ ENV_ID = "MinitaurBulletEnv-v0"
 pybullet = pytest.importorskip("pybullet")
 
 
-# Actions as functions of the step
-
-
 def trot(step, frequency=2.0, swing=0.5, extension=0.3):
     """Diagonal legs in phase, without looking at the robot: it walks slowly and stays up for a whole episode."""
     phase = 2 * math.pi * frequency * step * 0.01 + np.array([0, math.pi, math.pi, 0])
@@ -47,9 +44,6 @@ def random_actions(seed, hold=1):
     """Each held for `hold` steps: for 10, the robot falls soon; for 1 it trembles and stands."""
     actions = np.random.default_rng(seed).uniform(-1, 1, (1000, 8))
     return lambda step: actions[step // hold]
-
-
-# pybullet's own class
 
 
 @contextlib.contextmanager
@@ -204,9 +198,6 @@ def test_refuses_actions_out_of_bounds_as_the_original_does(pair, value):
             step(action)
 
 
-# Reset
-
-
 def test_draws_dynamics_in_their_ranges(env):
     simulator = env.unwrapped.simulator
     env.unwrapped._build()
@@ -350,9 +341,6 @@ def test_forward_velocity_is_the_way_by_the_time(env):
     assert env.unwrapped.x - start > 0.2
     # Every fifth of its moments is seen, and it walks nearly straight.
     assert np.mean(velocities) * 2.0 == pytest.approx(env.unwrapped.x - start, rel=0.15)
-
-
-# What other programs see
 
 
 def test_spaces_are_those_of_the_original(pair):

@@ -47,9 +47,6 @@ def refusal(script, *arguments):  # noqa: F811
     return str(error.value)
 
 
-# Files
-
-
 class CreatesFile:
     """Its pickle creates a file where it is loaded."""
 
@@ -172,9 +169,6 @@ def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):  # noq
         observations = torch.randn(50, *env.observation_space.shape)
     policy.load_state_dict(file["weights"])
     assert torch.equal(policy(observations), torch.export.load(reference / "policy.pt2").module()(observations))
-
-
-# Disks
 
 
 @pytest.fixture
@@ -304,9 +298,6 @@ def wait_for_the_other(module, path):
     before_call(common.Run, "_start_files", 1, wait)
 
 
-# Consoles
-
-
 def test_console_on_a_full_disk(script, tmp_path):  # noqa: F811
     run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", print_to_a_full_disk)
     assert_one_line(run, 1, "No space left")
@@ -412,9 +403,6 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
     assert shlex.split(hint) == ["python", "my dqn.py", "--resume", "a run"]
 
 
-# Processes. `Process.wait` asserts each time that nothing of the run has outlived it.
-
-
 def test_dead_environment_worker(tmp_path):
     arguments = flags("sac_minitaur", tmp_path / "run", "--num-envs", 2)
     run = Process("sac_minitaur", arguments, tmp_path / "output", kill_environment)
@@ -494,9 +482,6 @@ def train_in_a_pool(module):
     module.main = main
 
 
-# Films
-
-
 def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = Process(script, arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
@@ -574,9 +559,6 @@ def test_failing_film_costs_a_line_only(script, tmp_path):  # noqa: F811
 
 def die_filming(module):
     before_call(imageio, "get_writer", 1, die)
-
-
-# Losses
 
 
 def with_nan_rewards(module):

@@ -56,9 +56,6 @@ def before_update(module, count, action):
     before_call(getattr(module, AGENTS[module.__name__]), "update", count, action)
 
 
-# Hooks: the moments at which a run is killed.
-
-
 def collecting(module):
     before_call(getattr(module, AGENTS[module.__name__]), "random_actions", 40, die)
 
@@ -210,9 +207,6 @@ def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
     assert_same(saved["weights"], state["best"][1])
 
 
-# Stops
-
-
 def stop_and_continue(script, run_dir, output, arguments, hook):
     """Stops a run by the hook's signal and follows the command that it ends with. Returns the step it stopped at."""
     run = finish(script, arguments, output / "stopped", hook)
@@ -335,9 +329,6 @@ def train_seeds(module):
         processes[1].join()
 
     module.main = main
-
-
-# What may differ
 
 
 def test_every_other_change_is_refused(script, reference, monkeypatch):

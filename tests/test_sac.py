@@ -53,9 +53,6 @@ def make_batch(size=32, observation_size=3, action_size=2):
     return observations, actions, rewards, terminated, next_observations
 
 
-# The losses
-
-
 def test_td_targets():
     targets = sac_minitaur.td_targets(
         rewards=torch.tensor([1.0, 1.0, -2.0]),
@@ -97,9 +94,6 @@ def test_alpha_loss(log_prob, gradient):
     # An entropy of 2, above the target, lets α fall; one of −5 lets it rise.
     assert log_alpha.grad.item() == gradient
     assert log_probs.grad is None
-
-
-# The networks
 
 
 def test_actor_log_probabilities_are_those_of_torch_distributions():
@@ -179,9 +173,6 @@ def test_policy_acts_with_the_mean_in_the_tasks_units():
     assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
 
 
-# The replay buffer
-
-
 CPU = torch.device("cpu")
 
 
@@ -250,9 +241,6 @@ def test_replay_buffer_goes_on_from_its_state(stored, position):
     assert other.position == buffer.position == position
     assert len(state["rows"]) == min(stored, 5)  # a copy: what was added later is not in it
     assert state["rows"][:, 0].max() < stored
-
-
-# The agent
 
 
 @pytest.mark.parametrize("batch_norm", (True, False))
@@ -451,9 +439,6 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
         metrics = agent.update(batch)
         results.append({name: value.cpu() for name, value in (metrics | agent.state_dict()).items()})
     torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)
-
-
-# Training
 
 
 class StepCounter(gym.Env):
@@ -714,9 +699,6 @@ def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path, p
     assert exported.shape == (5, 1) and torch.equal(load_policy(path)(observations), exported)
 
 
-# Exported policies
-
-
 def test_exported_policy_runs_without_this_project(tiny_run, tmp_path):
     path, _ = tiny_run
     batches = [torch.randn(size, 3) * torch.tensor([1.0, 1.0, 8.0]) for size in (1, 2, 7)]
@@ -784,9 +766,6 @@ def test_evaluation_episodes_are_none_of_trainings():
     assert len(evaluation) == 100 and len(training) == 10_000 and not evaluation & training
 
 
-# Learning
-
-
 def test_learns_pendulum(tmp_path):
     path, _ = train(
         tmp_path / "run",
@@ -806,9 +785,6 @@ def test_learns_pendulum(tmp_path):
     assert [row["step"] for row in rows] == [0, 5000]
     assert random_return < -700 and rows[0]["average_return"] < -700
     assert rows[1]["average_return"] > -300  # a pendulum kept upright from the first swing on has about −150
-
-
-# What the user can get wrong
 
 
 def assert_one_line(status, stderr):
