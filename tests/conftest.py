@@ -1,4 +1,22 @@
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent.parent))
+pytest.register_assert_rewrite("runs")
+
+from runs import SCRIPTS, finish, flags  # noqa: E402
+
+
+@pytest.fixture(scope="session", params=SCRIPTS)
+def script(request):
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def reference(script, tmp_path_factory):
+    """An uninterrupted run with two environments; its directory."""
+    path = tmp_path_factory.mktemp(script)
+    finish(script, flags(script, path / "run", "--num-envs", 2), path / "output")
+    return path / "run"

@@ -84,6 +84,12 @@ class Process:
         return (self.output / "stderr").read_text()
 
 
+def finish(script, arguments, output, hook=None):
+    run = Process(script, arguments, output, hook)
+    assert run.wait() == 0, run.stderr
+    return run
+
+
 def wait_until(condition, seconds):
     deadline = time.monotonic() + seconds
     while not condition():
@@ -160,6 +166,43 @@ def assert_same(a, b, where="checkpoint"):
         assert a.dtype == b.dtype and torch.equal(a, b), where
     else:
         assert a == b or a != a and b != b, where
+
+
+def assert_same_run(run_dir, reference):
+    import torch
+
+    for name in ("train.csv", "eval.csv", "random.csv"):
+        assert rows(run_dir / name) == rows(reference / name), name
+    for name in ("checkpoint.pt", "policy.pt", "best_policy.pt"):
+        mine, other = (torch.load(path / name, weights_only=True) for path in (run_dir, reference))
+        for state in (mine, other):  # of which the tables were compared above, without times
+            for key in ("config", "seconds", "tables"):
+                state.pop(key, None)
+        assert_same(mine, other, name)
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def before_call(owner, name, count, action):
+    """Replaces a function by one that calls `action()` before its call number `count`."""
+    function, calls = getattr(owner, name), iter(range(1, 10**9))
+
+    def counted(*args, **kwargs):
+        if next(calls) == count:
+            action()
+        return function(*args, **kwargs)
+
+    setattr(owner, name, counted)
+
+
+def before_update(module, count, action):
+    before_call(getattr(module, AGENTS[module.__name__]), "update", count, action)
 
 
 def _serve():

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import common
-from runs import AGENTS, ROOT, SCRIPTS, Process, assert_same, checkpoint, flags, rows, session, start_ranks, wait_until
-from test_resume import assert_same_run, before_update, die
+from runs import AGENTS, ROOT, SCRIPTS, Process, assert_same, assert_same_run, before_update, checkpoint, die, flags
+from runs import rows, session, start_ranks, wait_until
 
 
 def end(ranks, statuses=None):

@@ -27,9 +27,8 @@ import pytest
 import torch
 
 import common
-from runs import ROOT, SCRIPTS, Process, checkpoint, flags, rows, session, wait_until
-from test_resume import assert_same_run, before_call, before_update, die, finish, interrupt
-from test_resume import reference, script  # noqa: F401 (fixtures)
+from runs import ROOT, SCRIPTS, Process, assert_same_run, before_call, before_update, checkpoint, die, finish, flags
+from runs import interrupt, rows, session, wait_until
 
 
 def assert_one_line(run, status, *words):
@@ -39,7 +38,7 @@ def assert_one_line(run, status, *words):
     assert all(word in lines[0] for word in words), lines[0]
 
 
-def refusal(script, *arguments):  # noqa: F811
+def refusal(script, *arguments):
     """The one line that refuses this command line."""
     argv = mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)])
     with argv, pytest.raises(common.InputError, match="^[^\n]*$") as error:
@@ -91,13 +90,13 @@ DAMAGES = {
 
 
 @pytest.fixture
-def copy(reference, tmp_path):  # noqa: F811
+def copy(reference, tmp_path):
     """A finished run, to be damaged."""
     return shutil.copytree(reference, tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", ["checkpoint.pt", "policy.pt"])
-def test_damaged_or_foreign_file(script, copy, tmp_path, name):  # noqa: F811
+def test_damaged_or_foreign_file(script, copy, tmp_path, name):
     whole, created = (copy / name).read_bytes(), tmp_path / "created"
     hostile = {
         "a hostile value": lambda path: path.write_bytes(saved({"format": CreatesFile(created)})),
@@ -112,7 +111,7 @@ def test_damaged_or_foreign_file(script, copy, tmp_path, name):  # noqa: F811
     assert_one_line(Process(script, arguments, tmp_path / "output"), 2, name)
 
 
-def test_checkpoint_of_another_version(script, copy):  # noqa: F811
+def test_checkpoint_of_another_version(script, copy):
     """It has a field more or one less: what that would have to be, nobody knows."""
     config = checkpoint(copy)["config"]
     older = {name: value for name, value in config.items() if name != "gamma"}
@@ -126,34 +125,34 @@ def test_checkpoint_of_another_version(script, copy):  # noqa: F811
     assert "no good" in (message := refusal(script, "--resume", copy)) and "gamma" in message
 
 
-def test_a_value_out_of_range_is_told_without_an_address(script, tmp_path):  # noqa: F811
+def test_a_value_out_of_range_is_told_without_an_address(script, tmp_path):
     process = Process(script, ["--gamma", "2"], tmp_path / "output")
     assert process.wait() == 2 and "less than or equal to 1" in process.stderr and "https" not in process.stderr
 
 
-def test_resume_and_evaluate_exclude_each_other(script, reference):  # noqa: F811
+def test_resume_and_evaluate_exclude_each_other(script, reference):
     assert "give one of them" in refusal(script, "--resume", reference, "--evaluate", reference / "policy.pt")
 
 
-def test_a_path_of_another_kind(script, reference):  # noqa: F811
+def test_a_path_of_another_kind(script, reference):
     saved, exported = reference / "checkpoint.pt", reference / "policy.pt2"
     for arguments in (["--evaluate", reference], ["--resume", saved], ["--evaluate", exported]):
         assert "--resume takes a run's directory, --evaluate its policy.pt" in refusal(script, *arguments)
 
 
-def test_a_network_that_was_changed_since(script, copy, tmp_path):  # noqa: F811
+def test_a_network_that_was_changed_since(script, copy, tmp_path):
     larger = {name: torch.stack((value, value)) for name, value in checkpoint(copy)["agent"].items()}
     change(copy / "checkpoint.pt", agent=larger)
     assert_one_line(Process(script, ["--resume", copy], tmp_path / "output"), 2, f"{copy} does not fit")
 
 
-def test_one_script_does_not_continue_the_other(script, reference):  # noqa: F811
+def test_one_script_does_not_continue_the_other(script, reference):
     other = SCRIPTS[1 - SCRIPTS.index(script)]
     assert f"is a checkpoint of {script}" in refusal(other, "--resume", reference)
     assert f"is a policy of {script}" in refusal(other, "--evaluate", reference / "policy.pt")
 
 
-def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):  # noqa: F811
+def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
     """Its file says on what task and on which episodes. The exported one does the same."""
     run = finish(script, ["--evaluate", reference / "policy.pt", "--no-video"], tmp_path / "output")
     header, *_, last = rows(reference / "eval.csv")
@@ -192,7 +191,7 @@ def fill(path):
             pass
 
 
-def test_full_disk(script, small_disk, reference, tmp_path):  # noqa: F811
+def test_full_disk(script, small_disk, reference, tmp_path):
     """The run says so and stops. With room again it continues, to the same end."""
     hook = partial(fill_disk, path=small_disk / "other people's")
     run = Process(script, flags(script, small_disk / "run", "--num-envs", 2), tmp_path / "output", hook)
@@ -209,7 +208,7 @@ def fill_disk(module, path):
     before_update(module, 110, lambda: fill(path))
 
 
-def test_full_disk_from_the_start(script, small_disk, tmp_path):  # noqa: F811
+def test_full_disk_from_the_start(script, small_disk, tmp_path):
     fill(small_disk / "other people's")
     run = Process(script, flags(script, small_disk / "run"), tmp_path / "output")
     run.wait()
@@ -231,13 +230,13 @@ def test_files_are_whole_or_not_there(tmp_path):
     assert path.read_bytes() == b"step,loss\n1,2\n" and list(tmp_path.iterdir()) == [path]
 
 
-def test_runs_that_start_at_once_have_directories_of_their_own(script):  # noqa: F811
+def test_runs_that_start_at_once_have_directories_of_their_own(script):
     config = importlib.import_module(script).Config(device="cpu")
     runs = [common.Run(config, script, None, None) for _ in range(2)]
     assert runs[0].path != runs[1].path and runs[0].path.parent == runs[1].path.parent == Path("runs")
 
 
-def test_one_process_trains_one_agent_at_a_time(script):  # noqa: F811
+def test_one_process_trains_one_agent_at_a_time(script):
     config = importlib.import_module(script).Config(device="cpu")
     for _ in range(2):
         with common.Run(config, script, None, None):
@@ -245,7 +244,7 @@ def test_one_process_trains_one_agent_at_a_time(script):  # noqa: F811
                 common.Run(config, script, None, None).__enter__()
 
 
-def test_a_run_that_cannot_start_leaves_the_process_as_it_was(script, monkeypatch):  # noqa: F811
+def test_a_run_that_cannot_start_leaves_the_process_as_it_was(script, monkeypatch):
     config = importlib.import_module(script).Config(device="cpu")
     before = [signal.getsignal(number) for number in common.STOP_SIGNALS]
     with monkeypatch.context() as disk:
@@ -278,7 +277,7 @@ def test_one_directory_for_two_runs_that_start_at_once(tmp_path):
     assert trained.status == 0 and checkpoint(tmp_path / "run")["step"] == 20
 
 
-def test_a_run_that_is_continued_while_it_runs(script, tmp_path):  # noqa: F811
+def test_a_run_that_is_continued_while_it_runs(script, tmp_path):
     """The older of the two processes stops. Each file is whole."""
     older = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "older")
     wait_until((tmp_path / "run" / "eval.csv").exists, 60)
@@ -298,7 +297,7 @@ def wait_for_the_other(module, path):
     before_call(common.Run, "_start_files", 1, wait)
 
 
-def test_console_on_a_full_disk(script, tmp_path):  # noqa: F811
+def test_console_on_a_full_disk(script, tmp_path):
     run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", print_to_a_full_disk)
     assert_one_line(run, 1, "No space left")
 
@@ -349,11 +348,11 @@ def test_trains_on_without_a_console(tmp_path, hook):
 
 
 @pytest.mark.parametrize("hook", [close_stdout, replace_stderr, have_no_streams])
-def test_evaluates_without_a_console(script, reference, tmp_path, hook):  # noqa: F811
+def test_evaluates_without_a_console(script, reference, tmp_path, hook):
     assert not finish(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", hook).stderr
 
 
-def test_evaluates_onto_a_full_disk(script, reference, tmp_path):  # noqa: F811
+def test_evaluates_onto_a_full_disk(script, reference, tmp_path):
     arguments = ["--evaluate", reference / "policy.pt"]
     assert_one_line(Process(script, arguments, tmp_path / "output", print_to_a_full_disk), 1, "No space left")
 
@@ -377,7 +376,7 @@ def have_no_streams_and_stop(module):
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "cp437"])
-def test_console_that_cannot_show_everything(script, encoding):  # noqa: F811
+def test_console_that_cannot_show_everything(script, encoding):
     command = [sys.executable, ROOT / f"{script}.py", "--help"]
     environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     result = subprocess.run(command, env=environ, capture_output=True)
@@ -422,7 +421,7 @@ def kill_environment(module):
     gym.vector.AsyncVectorEnv.step_async = step_async
 
 
-def test_dead_evaluation_worker(script, tmp_path):  # noqa: F811
+def test_dead_evaluation_worker(script, tmp_path):
     """With a network larger than a pipe: what is queued for the dead one must not hold up the end."""
     large = ["--layers" if script == "dqn_cartpole" else "--actor-layers", 256, 256, "--num-eval-episodes", 20]
     run = Process(script, flags(script, tmp_path / "run", *large), tmp_path / "output", die_evaluating)
@@ -433,7 +432,7 @@ def die_evaluating(module):
     before_call(module.Policy, "act", 3, die)
 
 
-def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
+def test_workers_end_with_the_main_process(script, tmp_path):
     """Which is killed in the midst of everything, while its workers work."""
     run = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "output")
     wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
@@ -442,7 +441,7 @@ def test_workers_end_with_the_main_process(script, tmp_path):  # noqa: F811
     assert run.wait() == -signal.SIGKILL
 
 
-def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):  # noqa: F811
+def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):
     run = Process(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", interrupt_acting)
     assert run.wait() == 130 and not run.stderr
 
@@ -451,7 +450,7 @@ def interrupt_acting(module):
     before_call(module.Policy, "act", 3, interrupt)
 
 
-def test_evaluations_take_the_cores_they_may_use(script):  # noqa: F811
+def test_evaluations_take_the_cores_they_may_use(script):
     config = importlib.import_module(script).Config(device="cpu")
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
@@ -462,7 +461,7 @@ def test_evaluations_take_the_cores_they_may_use(script):  # noqa: F811
         os.sched_setaffinity(0, allowed)
 
 
-def test_processes_that_cannot_train(script, tmp_path):  # noqa: F811
+def test_processes_that_cannot_train(script, tmp_path):
     run = Process(script, [], tmp_path / "pool", train_in_a_pool)
     assert_one_line(run, 2, "use multiprocessing.Process")
     for rank, wrong in (("0", "MASTER_ADDR"), ("abc", "abc")):
@@ -482,7 +481,7 @@ def train_in_a_pool(module):
     module.main = main
 
 
-def test_films_both_agents_without_a_display(script, tmp_path):  # noqa: F811
+def test_films_both_agents_without_a_display(script, tmp_path):
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = Process(script, arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
     assert run.wait() == 0 and not run.stderr, run.stderr
@@ -550,7 +549,7 @@ def test_a_film_that_the_disk_has_no_room_for_leaves_nothing(small_disk, monkeyp
     assert [path.name for path in small_disk.iterdir()] == ["other people's"]
 
 
-def test_failing_film_costs_a_line_only(script, tmp_path):  # noqa: F811
+def test_failing_film_costs_a_line_only(script, tmp_path):
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = finish(script, arguments, tmp_path / "output", die_filming)
     assert "warning: no trained_agent.mp4" in run.stdout and not run.stderr
@@ -573,7 +572,7 @@ def with_nan_rewards(module):
 
 
 @pytest.mark.parametrize("log_interval, name", [(1, "loss is nan"), (10**6, "is not finite")])
-def test_loss_that_is_not_a_number(script, tmp_path, log_interval, name):  # noqa: F811
+def test_loss_that_is_not_a_number(script, tmp_path, log_interval, name):
     """Stops the run when it is logged or saved, with the step and the part, and no checkpoint has taken it in."""
     few = ["--initial-collect-steps", 26, "--checkpoint-interval", 1, "--eval-interval", 10**6]
     arguments = flags(script, tmp_path / "run", *few, "--log-interval", log_interval)

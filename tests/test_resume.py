@@ -27,33 +27,10 @@ import pytest
 import torch
 
 import common
-from runs import AGENTS, ROOT, SCRIPTS, TASK, Process, assert_same, checkpoint, flags, rows, wait_until
+from runs import AGENTS, ROOT, TASK, Process, assert_same, assert_same_run, before_call, before_update, checkpoint
+from runs import die, finish, flags, interrupt, rows, wait_until
 
 CYCLES = int(os.environ.get("SOAK_CYCLES", 3))
-
-
-def die():
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def interrupt():
-    os.kill(os.getpid(), signal.SIGINT)
-
-
-def before_call(owner, name, count, action):
-    """Replaces a function by one that calls `action()` before its call number `count`."""
-    function, calls = getattr(owner, name), iter(range(1, 10**9))
-
-    def counted(*args, **kwargs):
-        if next(calls) == count:
-            action()
-        return function(*args, **kwargs)
-
-    setattr(owner, name, counted)
-
-
-def before_update(module, count, action):
-    before_call(getattr(module, AGENTS[module.__name__]), "update", count, action)
 
 
 def collecting(module):
@@ -96,36 +73,6 @@ def filming(module):
 
 
 MOMENTS = (collecting, evaluating, updating, writing_a_checkpoint, between_policy_and_checkpoint, filming)
-
-
-def finish(script, arguments, output, hook=None):
-    run = Process(script, arguments, output, hook)
-    assert run.wait() == 0, run.stderr
-    return run
-
-
-@pytest.fixture(scope="module", params=SCRIPTS)
-def script(request):
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def reference(script, tmp_path_factory):
-    """An uninterrupted run with two environments; its directory."""
-    path = tmp_path_factory.mktemp(script)
-    finish(script, flags(script, path / "run", "--num-envs", 2), path / "output")
-    return path / "run"
-
-
-def assert_same_run(run_dir, reference):
-    for name in ("train.csv", "eval.csv", "random.csv"):
-        assert rows(run_dir / name) == rows(reference / name), name
-    for name in ("checkpoint.pt", "policy.pt", "best_policy.pt"):
-        mine, other = (torch.load(path / name, weights_only=True) for path in (run_dir, reference))
-        for state in (mine, other):  # of which the tables were compared above, without times
-            for key in ("config", "seconds", "tables"):
-                state.pop(key, None)
-        assert_same(mine, other, name)
 
 
 def test_reference_is_worth_comparing_with(script, reference):
