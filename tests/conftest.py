@@ -2,11 +2,18 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 pytest.register_assert_rewrite("runs")
 
 from runs import SCRIPTS, finish, flags  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """For `-n 2` on two cores. A test may set another number."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", params=SCRIPTS)

@@ -143,10 +143,30 @@ def rows(path):
     return [[line[i] for i in keep] for line in lines]
 
 
+def read_csv(path):
+    """A CSV's rows as dicts of numbers."""
+    with open(path) as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
 def checkpoint(run_dir):
     import torch
 
     return torch.load(run_dir / "checkpoint.pt", weights_only=True)
+
+
+def load_policy(run_dir):
+    """The policy that `--evaluate` reads."""
+    import gymnasium as gym
+    import torch
+
+    file = torch.load(run_dir / "policy.pt", weights_only=True)
+    module = importlib.import_module(file["script"])
+    config = module.Config(**file["config"])
+    with gym.make(config.env_id) as env:
+        policy = module.Policy(config, env.observation_space, env.action_space)
+    policy.load_state_dict(file["weights"])
+    return policy
 
 
 def assert_same(a, b, where="checkpoint"):
