@@ -28,7 +28,7 @@ import torch
 
 import common
 from runs import ROOT, SCRIPTS, Process, assert_same_run, before_call, before_update, checkpoint, die, finish, flags
-from runs import interrupt, rows, session, wait_until
+from runs import interrupt, load_policy, rows, session, wait_until
 
 
 def assert_one_line(run, status, *words):
@@ -161,13 +161,10 @@ def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
     other_task.append("MountainCar-v0" if script == "dqn_cartpole" else "MountainCarContinuous-v0")
     assert_one_line(Process(script, other_task, tmp_path / "other"), 2, "policy.pt", "does not fit MountainCar")
 
-    module = importlib.import_module(script)
-    file = common.read_file(reference / "policy.pt", "policy", script)
-    with gym.make(file["config"]["env_id"]) as env:
-        policy = module.Policy(module.Config(**file["config"]), env.observation_space, env.action_space)
-        observations = torch.randn(50, *env.observation_space.shape)
-    policy.load_state_dict(file["weights"])
-    assert torch.equal(policy(observations), torch.export.load(reference / "policy.pt2").module()(observations))
+    policy, exported = load_policy(reference), torch.export.load(reference / "policy.pt2").module()
+    for batch in (1, 7, 300):
+        observations = torch.randn(batch, 4 if script == "dqn_cartpole" else 3)
+        assert torch.equal(policy(observations), exported(observations))
 
 
 @pytest.fixture
@@ -373,6 +370,14 @@ def have_no_streams_and_stop(module):
         interrupt()
 
     before_update(module, 50, reuse_their_numbers_and_stop)
+
+
+def test_bad_input_from_the_shell(script):
+    """Status 2 and one line, in a new interpreter."""
+    command = [sys.executable, ROOT / f"{script}.py", "--env-id", "NoSuchTask-v0"]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2 and not result.stdout
+    assert result.stderr.startswith("error: --env-id NoSuchTask-v0") and result.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "cp437"])

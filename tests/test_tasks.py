@@ -16,8 +16,9 @@ import torch
 
 import common
 import sac_minitaur
+from runs import checkpoint, load_policy, read_csv
 from sac_minitaur import Config, Policy
-from test_sac import TINY, load_policy, main, read_checkpoint, read_csv, train
+from test_sac import TINY, main, train
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:gymnasium")  # what it says of such tasks
 SHORT = dict(initial_collect_steps=40, num_iterations=20, replay_buffer_capacity=60, log_interval=20)
@@ -123,7 +124,7 @@ def register(monkeypatch):
 @pytest.mark.parametrize("high", [1, 3])  # the agent's actions themselves, or rescaled
 def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
     path, _ = train(tmp_path / "run", **SHORT, env_id=register(high=high, in_place=True), num_envs=2)
-    own = read_checkpoint(path)[1]
+    own = checkpoint(path)["ranks"][0]
     observations, actions, rewards, _, next_observations = own["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
     assert torch.equal(next_observations[:, :1], observations[:, :1] + 1) and torch.equal(
         rewards, next_observations[:, :1]
@@ -227,14 +228,14 @@ def test_observations_are_stored_as_they_are_returned(kind, scale, monkeypatch, 
     right = Echo._observation
     monkeypatch.setattr(Echo, "_observation", lambda self: scale * right(self))
     path, _ = train(tmp_path / "run", **SHORT, env_id=register(observations=gym.spaces.Box(0, 9, (2,), kind)))
-    rows = read_checkpoint(path)[1]["buffer"]["rows"]
+    rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
     assert rows[:, 0].unique().tolist() == [0, scale, 2 * scale, 3 * scale]
 
 
 def test_a_task_that_draws_from_numpys_own_generator_draws_anew_in_every_worker(monkeypatch, tmp_path):
     monkeypatch.setattr(Echo, "_observation", lambda self: np.random.rand(2))
     path, _ = train(tmp_path / "run", **SHORT, **IDS, num_envs=3)
-    rows = read_checkpoint(path)[1]["buffer"]["rows"]
+    rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
     assert len(rows[:, 0].unique()) == len(rows)
 
 
@@ -366,10 +367,10 @@ def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, ca
     config = Config(**TINY | SHORT | IDS | choices, run_dir=tmp_path / "run")
     path = sac_minitaur.train(config)
     assert main(monkeypatch, "--resume", path, "--num-iterations", 25) == 0
-    assert read_checkpoint(path)[0]["step"] == 25
-    assert read_checkpoint(path)[0]["config"]["seed"] == 3
+    assert checkpoint(path)["step"] == 25
+    assert checkpoint(path)["config"]["seed"] == 3
     again = Config(**TINY | SHORT | IDS | choices | {"num_iterations": 30}, resume=str(path))
-    assert sac_minitaur.train(again) == path and read_checkpoint(path)[0]["step"] == 30
+    assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 30
 
 
 def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path, capsys):
@@ -379,7 +380,7 @@ def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path,
     monkeypatch.setattr(Unrepeatable, "length", 5)
     train(tmp_path / "run", **choices | {"num_iterations": 40}, run_dir=None, resume=str(tmp_path / "run"))
     assert "warning: an episode went differently" in capsys.readouterr().out
-    rows = read_checkpoint(tmp_path / "run")[1]["buffer"]["rows"]
+    rows = checkpoint(tmp_path / "run")["ranks"][0]["buffer"]["rows"]
     assert len(rows) == 40 + 40 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
 
 
