@@ -261,6 +261,7 @@ def _serve():
 def _run(script, arguments, output, hook, environ):
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell started in the background
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored below nohup
     for descriptor, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(os.open(f"{output}/{name}", os.O_WRONLY | os.O_CREAT | os.O_APPEND), descriptor)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
