@@ -203,19 +203,14 @@ def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
             common.select_device(name, rank)
 
 
-def test_batch_that_cannot_be_shared(tmp_path):
-    arguments = flags("sac_minitaur", tmp_path / "run", "--batch-size", 25)
-    ranks = start_ranks(2, "sac_minitaur", arguments, tmp_path / "output")
-    end(ranks, [2, 2])
-    assert ranks[0].stderr == "error: --batch-size 25 cannot be shared by 2 processes\n"
-    assert not (tmp_path / "run").exists()
-
-
-def test_first_steps_that_are_too_few_for_two_processes(tmp_path):
-    few = ("--num-envs", 1, "--initial-collect-steps", 256, "--batch-size", 258, "--replay-buffer-capacity", 1000)
+@pytest.mark.parametrize(
+    "size, said", [(25, "cannot be shared by 2 processes"), (258, "is more than the 256 transitions stored at first")]
+)
+def test_batches_that_two_processes_cannot_take(size, said, tmp_path):
+    few = ("--batch-size", size, "--initial-collect-steps", 256, "--replay-buffer-capacity", 1000)
     ranks = start_ranks(2, "sac_minitaur", flags("sac_minitaur", tmp_path / "run", *few), tmp_path / "output")
     end(ranks, [2, 2])
-    assert ranks[0].stderr == "error: --batch-size 258 is more than the 256 transitions stored at first\n"
+    assert ranks[0].stderr == f"error: --batch-size {size} {said}\n"
     assert not (tmp_path / "run").exists()
 
 

@@ -704,9 +704,9 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
         ("--batch-size 300", "--batch-size 300"),
         ("--replay-buffer-capacity 9000000000000000", "--replay-buffer-capacity 9000000000000000 takes 324000000.0 GB"),
         ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
-        ("--resume nowhere", "nowhere"),
+        ("--resume nowhere", "nowhere/checkpoint.pt does not exist"),
         ("--resume=", "checkpoint.pt"),  # as of a shell's variable that is not set
-        ("--evaluate nowhere.pt", "nowhere.pt"),
+        ("--evaluate nowhere.pt", "nowhere.pt does not exist"),
         ("--evaluate full/file", "full/file"),
         ("--evaluate=", "policy"),
         ("--run-dir full", "not empty"),
@@ -718,8 +718,8 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("somebody's work")
-    flags = "--env-id Pendulum-v1 --device cpu --initial-collect-steps 250 --batch-size 32 --run-dir run"
-    assert main(monkeypatch, *flags.split(), *arguments.split()) == 2
+    flags = "--env-id Pendulum-v1 --device cpu --initial-collect-steps 250 --batch-size 32 --num-iterations 1"
+    assert main(monkeypatch, *flags.split(), "--run-dir", "run", *arguments.split()) == 2
     output = capfd.readouterr()
     assert output.err.startswith("error: ") and output.err.count("\n") == 1
     assert named in output.err and output.out == ""
