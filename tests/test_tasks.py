@@ -111,10 +111,10 @@ IDS = {"env_id": f"{__name__}:Echo-v0"}
 
 @pytest.fixture
 def register(monkeypatch):
-    """Registers an `Echo` for one test and returns its id."""
+    """Registers a task for one test and returns its id."""
 
-    def register(**kwargs):
-        spec = gym.envs.registration.EnvSpec("Mine-v0", entry_point=Echo, max_episode_steps=4, kwargs=kwargs)
+    def register(entry_point=Echo, limit=4, **kwargs):
+        spec = gym.envs.registration.EnvSpec("Mine-v0", entry_point, max_episode_steps=limit, kwargs=kwargs)
         monkeypatch.setitem(gym.registry, "Mine-v0", spec)
         return "Mine-v0"
 
@@ -126,9 +126,8 @@ def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
     path, _ = train(tmp_path / "run", **SHORT, env_id=register(high=high, in_place=True), num_envs=2)
     own = checkpoint(path)["ranks"][0]
     observations, actions, rewards, _, next_observations = own["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
-    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1) and torch.equal(
-        rewards, next_observations[:, :1]
-    )
+    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1)
+    assert torch.equal(rewards, next_observations[:, :1])
     assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
     torch.testing.assert_close(next_observations[:, 1:], actions if high == 1 else 1 + 2 * actions)
     # Those of the running episodes, to be played again on resume.
@@ -201,15 +200,14 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
     assert common.find_task(longer, gym.spaces.Box)[0].max_episode_steps == 300
 
 
-def test_a_task_that_wraps_another(monkeypatch):
+def test_a_task_that_wraps_another(register):
     """With a function, which gymnasium finds unequal to its like in the spec of an environment made before."""
 
     def make():
         space = gym.spaces.Box(-99, 99, (3,))
         return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, space)
 
-    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
-    task, observation_space, _ = common.find_task(Config(env_id="Mine-v0"), gym.spaces.Box)
+    task, observation_space, _ = common.find_task(Config(env_id=register(make, None)), gym.spaces.Box)
     assert task.max_episode_steps == 200 and observation_space.high[0] == 99  # the limit of the one that is wrapped
     with gym.make(task) as env:
         assert env.observation_space == observation_space
@@ -240,19 +238,19 @@ def test_a_task_that_draws_from_numpys_own_generator_draws_anew_in_every_worker(
 
 
 @pytest.mark.parametrize("in_workers", [True, False])
-def test_the_program_that_a_task_starts_is_ended_with_it(in_workers, monkeypatch, tmp_path):
-    new = {"entry_point": Starts, "max_episode_steps": 4, "kwargs": {"pids": tmp_path / "pids"}}
-    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", **new))
+def test_the_program_that_a_task_starts_is_ended_with_it(in_workers, register, monkeypatch, tmp_path):
     begin = common.Environments.__init__
     monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=in_workers))
-    train(tmp_path / "run", **SHORT, env_id="Mine-v0", num_envs=2)
+    train(tmp_path / "run", **SHORT, env_id=register(Starts, pids=tmp_path / "pids"), num_envs=2)
     pids = (tmp_path / "pids").read_text().split()
     assert len(pids) >= 7 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])  # the last is too large for float32
-@pytest.mark.parametrize("where", ["reward", "observation", "first observation"])
+@pytest.mark.parametrize(
+    "where, value",  # 1e39 is too large for float32
+    [("reward", np.nan), ("reward", 1e39), ("observation", np.inf), ("observation", 1e39), ("first observation", 1e39)],
+)
 def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_path):
     step, reset = Echo.step, Echo.reset
 
@@ -269,8 +267,7 @@ def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_p
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-@pytest.mark.parametrize("wrong", [np.zeros(3), np.float32(0), np.zeros((1, 3))], ids=np.shape)
-@pytest.mark.parametrize("when", [0, 3])
+@pytest.mark.parametrize("when, wrong", [(0, np.zeros(3)), (3, np.float32(0)), (3, np.zeros((1, 3)))], ids=np.shape)
 def test_a_task_that_returns_another_shape(when, wrong, monkeypatch, tmp_path):
     right = Echo._observation
     monkeypatch.setattr(Echo, "_observation", lambda self: wrong if self.state[0] == when else right(self))
@@ -307,15 +304,14 @@ def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeyp
     assert not (tmp_path / "waited for").exists()
 
 
-def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(monkeypatch, tmp_path):
+def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(register, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "broken_module.py").write_text("1 / 0")
     with pytest.raises(ZeroDivisionError):
         main(monkeypatch, "--env-id", "broken_module:Task-v0")
     for make, error in ((lambda: [].pop(), IndexError), (lambda: open(tmp_path / "map"), FileNotFoundError)):
-        monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
         with pytest.raises(error):
-            main(monkeypatch, "--env-id", "Mine-v0")
+            main(monkeypatch, "--env-id", register(make))
 
 
 def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
@@ -329,18 +325,17 @@ def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("steps", [0, 50])
-def test_a_task_that_changes_the_directory(steps, monkeypatch, tmp_path):
+def test_a_task_that_changes_the_directory(steps, register, monkeypatch, tmp_path):
     """The run lies where the user asked, and the film."""
 
     def make(render_mode=None):
         return Moves(gym.make("Pendulum-v1", render_mode=render_mode), tmp_path / "assets", steps)
 
     (tmp_path / "assets").mkdir()
-    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make, max_episode_steps=20))
     begin = common.Environments.__init__
     monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=False))
     monkeypatch.chdir(tmp_path)
-    sac_minitaur.train(Config(**TINY | SHORT | {"env_id": "Mine-v0", "run_dir": "run", "video": True}))
+    sac_minitaur.train(Config(**TINY | SHORT | {"env_id": register(make, 20), "run_dir": "run", "video": True}))
     assert Path.cwd() == tmp_path / "assets"
     monkeypatch.chdir(tmp_path)
     assert main(monkeypatch, "--evaluate", "run/policy.pt") == 0
@@ -349,7 +344,7 @@ def test_a_task_that_changes_the_directory(steps, monkeypatch, tmp_path):
     assert not any((tmp_path / "assets").iterdir())
 
 
-def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
+def test_a_task_that_cannot_be_made_a_second_time(register, tmp_path):
     once = iter([Echo()])
 
     def make():
@@ -357,9 +352,8 @@ def test_a_task_that_cannot_be_made_a_second_time(monkeypatch, tmp_path):
             return env
         raise ConnectionError("no second server")
 
-    monkeypatch.setitem(gym.registry, "Mine-v0", gym.envs.registration.EnvSpec("Mine-v0", make))
     with pytest.raises(common.TaskError, match="in make\n(.|\n)*no second server"):
-        train(tmp_path / "run", **SHORT, env_id="Mine-v0")
+        train(tmp_path / "run", **SHORT, env_id=register(make))
 
 
 def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, capsys):
