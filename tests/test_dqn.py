@@ -4,7 +4,6 @@ import dataclasses
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -15,10 +14,8 @@ from pydantic import ValidationError
 import common
 import dqn_cartpole
 from dqn_cartpole import Config, DQNAgent, QNetwork, ReplayBuffer
-from runs import assert_same_run, checkpoint, read_csv
+from runs import ROOT, assert_same_run, checkpoint, read_csv
 
-ROOT = Path(dqn_cartpole.__file__).parent
-CPU = torch.device("cpu")
 TINY = Config(
     num_iterations=60, initial_collect_steps=50, batch_size=16, replay_buffer_capacity=200, layers=(8, 6),
     log_interval=10, eval_interval=20, num_eval_episodes=2, checkpoint_interval=25, device="cpu", video=False,
@@ -91,7 +88,7 @@ def test_initialization():
 
 
 def test_buffer_overwrites_the_oldest():
-    buffer = ReplayBuffer(5, 2, CPU)
+    buffer = ReplayBuffer(5, 2, "cpu")
     for i in range(7):
         value = np.full((1, 2), i, np.float32)
         buffer.add(value, np.array([i % 2]), np.array([10.0 * i]), np.array([i == 4]), value + 0.5)
@@ -104,7 +101,7 @@ def test_buffer_overwrites_the_oldest():
 
 
 def test_several_environments_fill_the_buffer_across_its_end():
-    buffer, saved = ReplayBuffer(4, 1, CPU), []
+    buffer, saved = ReplayBuffer(4, 1, "cpu"), []
     for i in range(2):
         column = np.arange(3.0) + 3 * i
         buffer.add(column[:, None], np.zeros(3), column, np.zeros(3), column[:, None])
@@ -375,7 +372,7 @@ def test_config_refuses_what_no_run_can_use(field, values):
 
 def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     """The tutorial's values; a flag beside --tutorial counts."""
-    source = Path(dqn_cartpole.__file__).read_text().splitlines()
+    source = (ROOT / "dqn_cartpole.py").read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in source if "  # ours (" in line and ": " in line}
     assert ours == set(dqn_cartpole.TUTORIAL)
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "0.9"])

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 import sac_minitaur
+from runs import ROOT
 
-ROOT = Path(__file__).parent.parent
 ENV_ID = "MinitaurBulletEnv-v0"
 pybullet = pytest.importorskip("pybullet")
 

@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -21,10 +20,9 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 import common
 import sac_minitaur
-from runs import assert_same, assert_same_run, checkpoint, load_policy, read_csv
+from runs import ROOT, assert_same, assert_same_run, checkpoint, load_policy, read_csv
 from sac_minitaur import Actor, Config, Policy, ReplayBuffer, SACAgent
 
-ROOT = Path(__file__).parent.parent
 # The tutorials' values, here written down a second time.
 TUTORIALS = dict(
     actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
@@ -173,9 +171,6 @@ def test_policy_acts_with_the_mean_in_the_tasks_units():
     assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
 
 
-CPU = torch.device("cpu")
-
-
 def numbered(first, count):
     """Steps of one environment (2 observations, 1 action) whose numbers tell where they belong: 0 to 3 are an episode
     that ends, 4 and more are of the next."""
@@ -187,11 +182,10 @@ def numbered(first, count):
 def filled(buffer, first, count):
     for step in numbered(first, count):
         buffer.add(*step)
-    return buffer
 
 
 def test_replay_buffer_keeps_what_each_environment_did():
-    buffer = ReplayBuffer(99, 2, 1, CPU)
+    buffer = ReplayBuffer(99, 2, 1, "cpu")
     for steps in zip(numbered(0, 8), numbered(10, 8)):  # of two environments
         buffer.add(*(np.concatenate(pair) for pair in zip(*steps)))
     observations, actions, rewards, terminated, next_observations = buffer.rows[:16].split((2, 1, 1, 1, 2), dim=1)
@@ -206,7 +200,7 @@ def test_replay_buffer_keeps_what_each_environment_did():
 
 def test_replay_buffer_samples_all_that_is_stored_and_nothing_else():
     torch.manual_seed(0)
-    buffer = ReplayBuffer(5, 2, 1, CPU)
+    buffer = ReplayBuffer(5, 2, 1, "cpu")
     buffer.rows.fill_(torch.nan)
     filled(buffer, 0, 3)
     observations, actions, rewards, terminated, next_observations = buffer.sample(200)
@@ -346,7 +340,7 @@ def test_the_tutorials_values_are_the_defaults():
 
 
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
-    lines = Path(sac_minitaur.__file__).read_text().splitlines()
+    lines = (ROOT / "sac_minitaur.py").read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
     assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 12
     assert vars(Config(tutorial=True)) == vars(Config(**TUTORIALS)) | {"tutorial": True}
@@ -741,6 +735,7 @@ def test_bad_input_is_one_line_and_status_2(arguments, named, monkeypatch, capfd
         ("action", gym.spaces.Box(-1, 1, (2,), np.longdouble)),
         ("observation", gym.spaces.Box(-1, 1, ())),
         ("observation", gym.spaces.Discrete(3)),
+        ("observation", gym.spaces.MultiBinary(3)),
     ],
 )
 def test_spaces_that_sac_cannot_use(kind, space, monkeypatch):

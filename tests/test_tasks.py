@@ -267,7 +267,7 @@ def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_p
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-@pytest.mark.parametrize("when, wrong", [(0, np.zeros(3)), (3, np.float32(0)), (3, np.zeros((1, 3)))], ids=np.shape)
+@pytest.mark.parametrize("when, wrong", [(0, np.zeros(3)), (3, np.float32(0)), (3, np.zeros((1, 2)))], ids=np.shape)
 def test_a_task_that_returns_another_shape(when, wrong, monkeypatch, tmp_path):
     right = Echo._observation
     monkeypatch.setattr(Echo, "_observation", lambda self: wrong if self.state[0] == when else right(self))
