@@ -394,10 +394,9 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, choices):
 class StepCounter(gym.Env):
     """Its observation says which episode and step it is. At step 4 it terminates, or leaves that to a time limit."""
 
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    observation_space, action_space = gym.spaces.Box(-np.inf, np.inf, (2,)), gym.spaces.Box(-1, 1, (1,))
 
-    def __init__(self, action_space=None, terminates=False):
-        self.action_space = action_space or gym.spaces.Box(-1, 1, (1,))
+    def __init__(self, terminates=False):
         self.terminates, self.episode = terminates, 0
 
     def reset(self, *, seed=None, options=None):
