@@ -60,14 +60,15 @@ def test_scaling_maps_bounds_to_one():
     assert torch.equal(unscaled.scaling(observations), observations)
 
 
-def test_bounds_that_cartpole_does_not_reach_are_none():
+@pytest.mark.parametrize("bound", [1e3, 1e6])
+def test_bounds_that_cartpole_does_not_reach_are_none(bound):
     with gym.make("CartPole-v0") as env:
         env.action_space.seed(0)
         observations = [env.reset(seed=0)[0]]
         while len(observations) < 100:
             observation, _, terminated, *_ = env.step(env.action_space.sample())
             observations.append(env.reset()[0] if terminated else observation)
-    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(-1e3, 1e3, (4,)))
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(-bound, bound, (4,)))
     scaling.fit(observations := torch.tensor(np.array(observations)), common.Ranks())
     assert torch.equal(scaling(observations), observations)
 

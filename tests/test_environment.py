@@ -83,12 +83,12 @@ class Pair:
         minitaur.SetMotorViscousDamping(dynamics.viscous_damping)
         minitaur.SetFootFriction(dynamics.foot_friction)
 
-    def play(self, seed, act, dtype, num_steps=None):
+    def play(self, seed, act, dtype, num_steps=None, options=None):
         """Steps both and compares: to the end of the episode, or for `num_steps` whatever happens.
 
         Returns the number of steps, and whether and when the robot fell and a motor was switched off.
         """
-        observation, _ = self.env.reset(seed=seed)
+        observation, _ = self.env.reset(seed=seed, options=options)
         assert_same_observation(observation, self.original.reset())
         fell_at = overheated_at = None
         for step in range(num_steps or 1000):
@@ -159,6 +159,11 @@ def test_equals_the_original_in_a_fall_after_a_walk(pair):
     assert any(fell_at is not None and fell_at > 100 for fell_at in falls)
 
 
+def test_equals_the_original_walking_with_float64_actions(pair):
+    steps, fell_at, _ = pair.play(4, trot, np.float64, num_steps=300)
+    assert fell_at is None
+
+
 def test_equals_the_original_with_whole_numbers(pair):
     pair.env.reset(seed=0)
     pair.original.reset()
@@ -174,6 +179,12 @@ def test_equals_the_original_when_motors_overheat(pair):
     assert overheated_at is not None and 100 < overheated_at < 200  # the steps after the switch-off are compared too
     # The next reset switches the motors on again, in both.
     assert pair.play(0, trot, np.float64, num_steps=20)[2] is None
+
+
+def test_equals_the_original_with_dynamics_of_ones_own(pair):
+    dynamics = sac_minitaur.Dynamics(3.0, 0.1, 0.3, 15.0, 0.005, 1.0)
+    pair.play(0, trot, np.float64, num_steps=50, options={"dynamics": dynamics})
+    assert pair.env.unwrapped.dynamics is dynamics
 
 
 @pytest.mark.parametrize("value", [1.02, -1.02, np.nan, np.inf])
@@ -306,6 +317,11 @@ def test_privileged_observation_is_in_the_bodys_own_frame(env):
     privileged = minitaur.privileged_observation()
     assert privileged.dtype == np.float32
     np.testing.assert_allclose(privileged, [1, 2, 3, 4, 5, 6, 5], atol=1e-6)
+
+
+def test_spaces_are_those_of_the_original(pair):
+    assert pair.env.observation_space == pair.original.observation_space
+    assert pair.env.action_space == pair.original.action_space
 
 
 def test_spaces_are_those_that_the_tutorials_print(env):
