@@ -445,13 +445,13 @@ def train(config):
             if env_steps >= due:
                 metrics = agent.update(buffer.sample(batch_size))
                 step += 1
-                run.log_training(step, env_steps, envs, metrics)
+                run.log_training(step, env_steps, envs, metrics)  # a row every log_interval updates
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step, env_steps, agent, buffer, envs)
 
-        run.finish(step, env_steps, agent, buffer, envs, observation_space)
+        run.finish(step, env_steps, agent, buffer, envs, observation_space)  # checkpoint, evaluation, curve, films
         return run.path
 
 
