@@ -23,7 +23,7 @@ def script(request):
 
 @pytest.fixture(scope="session")
 def reference(script, tmp_path_factory):
-    """An uninterrupted run with two environments; its directory."""
+    """An uninterrupted run with two environments; its directory, which no test changes."""
     path = tmp_path_factory.mktemp(script)
     finish(script, flags(script, path / "run", "--num-envs", 2), path / "output")
     return path / "run"

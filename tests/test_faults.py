@@ -336,12 +336,12 @@ def test_trains_on_without_a_console(tmp_path, hook):
 
 
 @pytest.mark.parametrize("hook", [replace_stderr, have_no_streams])
-def test_evaluates_without_a_console(script, reference, tmp_path, hook):
-    assert not finish(script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", hook).stderr
+def test_evaluates_without_a_console(script, copy, tmp_path, hook):
+    assert not finish(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", hook).stderr
 
 
-def test_evaluates_onto_a_full_disk(script, reference, tmp_path):
-    arguments = ["--evaluate", reference / "policy.pt"]
+def test_evaluates_onto_a_full_disk(script, copy, tmp_path):
+    arguments = ["--evaluate", copy / "policy.pt"]
     assert_one_line(Process(script, arguments, tmp_path / "output", print_to_a_full_disk), 1, "No space left")
 
 
@@ -432,10 +432,8 @@ def test_workers_end_with_the_main_process(script, tmp_path):
     assert run.wait() == -signal.SIGKILL
 
 
-def test_interrupted_evaluation_of_a_policy(script, reference, tmp_path):
-    run = Process(
-        script, ["--evaluate", reference / "policy.pt"], tmp_path / "output", partial(acting, action=interrupt)
-    )
+def test_interrupted_evaluation_of_a_policy(script, copy, tmp_path):
+    run = Process(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", partial(acting, action=interrupt))
     assert run.wait() == 130 and not run.stderr
 
 
