@@ -229,6 +229,13 @@ class Ranks:
             for tensor, total in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
                 tensor.copy_(total.view_as(tensor) / self.world_size)
 
+    def share(self, value):
+        """Rank 0's value, on every rank."""
+        values = [value]
+        if self.world_size > 1:
+            dist.broadcast_object_list(values)
+        return values[0]
+
     def gather(self, value):
         """The list of every rank's value on rank 0, None on the others."""
         values = [value] * self.world_size if self.rank == 0 else None
@@ -265,8 +272,8 @@ def find_task(config, action_space):
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
         floats = np.float16, np.float32, np.float64
-        if fits := fits and actions.shape and 0 not in actions.shape and actions.dtype in floats:
-            # In float32, as the agent computes.
+        fits = fits and actions.shape and 0 not in actions.shape and actions.dtype in floats
+        if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = (widths.isfinite() & (widths > 0)).all()
     if not fits:
@@ -496,7 +503,7 @@ class Run:
             self._require_same_run(self.checkpoint["config"])
         # To the microsecond, for runs that are started at once.
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
-        self.path = config.resume or config.run_dir or Path("runs") / name
+        self.path = config.resume or config.run_dir or self.ranks.share(Path("runs") / name)
         self.directory = self.path.absolute()  # a task may change the current one
         # What the run has found; a snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
@@ -558,7 +565,7 @@ class Run:
 
     def _how_to_continue(self):
         if not (self.directory / "checkpoint.pt").exists():
-            return "there is no checkpoint yet" if self.writes else "rank 0 has the checkpoint"
+            return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
         program = Path(getattr(module, "__file__", f"{self.script}.py")).name
@@ -599,8 +606,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        bar = {"disable": None if self.writes and sys.stderr else True}  # None: where stderr is a terminal
-        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", **bar)
+        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
+        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
         self.stack.enter_context(self.progress)
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")

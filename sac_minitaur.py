@@ -275,9 +275,9 @@ class SACAgent(nn.Module):
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         # One optimizer for the actor and α, which learn from the same sample of actions.
-        actor = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
-        alpha = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
-        self.actor_optimizer = torch.optim.Adam([actor, alpha], **adam)
+        actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
+        alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
+        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)
         self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
 
     def random_actions(self, count):

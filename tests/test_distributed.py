@@ -86,6 +86,20 @@ def test_averaged_gradients_equal_those_of_the_joined_batch(world_size, tmp_path
                 torch.testing.assert_close(gradient, right, rtol=1e-5, atol=1e-6 * float(right.abs().max()))
 
 
+def save_path(module, directory):
+    def main():
+        run = common.Run(module.Config(device="cpu"), module.__name__, None, None)
+        Path(f"{directory}/{run.ranks.rank}").write_text(str(run.path))
+
+    module.main = main
+
+
+def test_all_ranks_name_the_same_new_directory(tmp_path):
+    end(start_ranks(2, "dqn_cartpole", [], tmp_path / "output", partial(save_path, directory=tmp_path)))
+    first, second = ((tmp_path / rank).read_text() for rank in "01")
+    assert first == second and first.startswith("runs/dqn_cartpole-")
+
+
 def save_agent_at(module, directory, count):
     """Saves each rank's agent, as it is after that many updates."""
     agent_class = getattr(module, AGENTS[module.__name__])

@@ -371,9 +371,10 @@ def test_bad_input_from_the_shell(script):
     assert result.stderr.startswith("error: --env-id NoSuchTask-v0") and result.stderr.count("\n") == 1
 
 
-def test_console_that_cannot_show_everything(script):
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437"])
+def test_console_that_cannot_show_everything(script, encoding):
     command = [sys.executable, ROOT / f"{script}.py", "--help"]
-    environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "cp1252"}
+    environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     result = subprocess.run(command, env=environ, capture_output=True)
     assert result.returncode == 0 and b"--num-iterations" in result.stdout, result.stderr
 

@@ -292,6 +292,18 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
         assert not torch.equal(own, before) and own.grad is None
 
 
+def test_update_learns_from_terminated_and_truncated_differently():
+    batch = make_batch()
+    losses = []
+    for terminated in (torch.zeros(32), torch.ones(32)):
+        torch.manual_seed(0)
+        agent = make_agent(**TUTORIALS)
+        losses.append(agent.update((*batch[:3], terminated, batch[4]))["critic_loss"].item())
+    q = make_agent(**TUTORIALS).critics(*batch[:2])
+    assert losses[1] == pytest.approx(0.5 * (q - batch[2]).square().mean(1).sum().item(), rel=1e-5)
+    assert abs(losses[0] - losses[1]) > 0.01
+
+
 def test_act_samples_or_takes_the_mean():
     agent = make_agent()
     agent.update(make_batch())  # so that the averaged actor is not the actor
