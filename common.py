@@ -101,34 +101,36 @@ Parallel = Annotated[int, Field(ge=1, le=1024)]  # environments, threads
 Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
-def with_tutorial_values(given, tutorial):
-    """What `Config` is given. With `tutorial=True` the rest has the values in `tutorial`."""
-    values = given.kwargs or {}
-    return ArgsKwargs(given.args, tutorial | values) if values.get("tutorial") else given
+def complete_config(given, config_class, tutorial, script):
+    """What `Config` is given. The rest is that of the run to resume, of the run that saved the policy to evaluate, or
+    with `tutorial=True` the values in `tutorial`. Raises InputError when a file is no good."""
+    names = config_class.__dataclass_fields__.keys()
+    values = dict(zip(names, given.args or ())) | (given.kwargs or {})
+    rest = tutorial if values.get("tutorial") else {}
+    if names > values.keys():  # the command line gives all of them, completed before
+        if run := values.get("resume"):
+            rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
+            if others := rest.keys() ^ names:
+                raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
+        elif policy := values.get("evaluate"):
+            rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
+    return ArgsKwargs((), rest | values)
 
 
-def read_command_line(config_class, description, script):
-    """The config that the command line asks for. Its defaults are those of `config_class`, of the tutorial
-    (--tutorial), of the run to resume (--resume) or of the run that saved the policy (--evaluate)."""
+def read_command_line(config_class, description):
+    """The config that the command line asks for. Where a flag is not given, `complete_config` has the value."""
     sources = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--resume", "--evaluate"):
         sources.add_argument(flag, type=Path, nargs="?")
-    given, _ = sources.parse_known_args()
-    if given.resume and given.evaluate:
+    sources.add_argument("--tutorial", action="store_true")
+    given = {name: value for name, value in vars(sources.parse_known_args()[0]).items() if value}
+    if given.keys() >= {"resume", "evaluate"}:
         raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
-    default = config_class(tutorial="--tutorial" in sys.argv)
-    if source := given.resume or given.evaluate:
-        if given.resume:
-            saved = read_file(source / "checkpoint.pt", "checkpoint", script)["config"]
-        else:  # a policy may be older than a fork's field
-            saved = vars(default) | read_file(source, "policy", script)["config"] | {"video": True}
-        if others := saved.keys() ^ vars(default).keys():
-            raise InputError(f"{source} is of another version of this script: it differs in {min(others)}")
-        try:
-            default = config_class(**saved)
-        except ValueError as error:
-            what = " ".join(str(error).split())
-            raise InputError(f"{source} has a config that is no good: {what}") from None
+    try:
+        default = config_class(**given)
+    except ValueError as error:
+        what = " ".join(str(error).split())
+        raise InputError(f"{given.get('resume', given.get('evaluate'))} has a config that is no good: {what}") from None
     return tyro.cli(config_class, description=description, default=default)
 
 

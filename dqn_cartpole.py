@@ -77,8 +77,8 @@ class Config:
 
     @model_validator(mode="before")
     @classmethod
-    def _tutorial(cls, given):
-        return common.with_tutorial_values(given, TUTORIAL)
+    def _complete(cls, given):
+        return common.complete_config(given, cls, TUTORIAL, "dqn_cartpole")
 
     @model_validator(mode="after")
     def _finite_worth(self):
@@ -343,7 +343,7 @@ def train(config):
 
 
 def main():
-    config = common.read_command_line(Config, __doc__, "dqn_cartpole")
+    config = common.read_command_line(Config, __doc__)
     if config.evaluate is None:
         train(config)
     else:

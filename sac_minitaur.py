@@ -82,8 +82,8 @@ class Config:
 
     @model_validator(mode="before")
     @classmethod
-    def _tutorial(cls, given):
-        return common.with_tutorial_values(given, TUTORIAL)
+    def _complete(cls, given):
+        return common.complete_config(given, cls, TUTORIAL, "sac_minitaur")
 
 
 TUTORIAL = dict(
@@ -663,7 +663,7 @@ if "MinitaurBulletEnv-v0" not in gym.registry:
 
 
 def main():
-    config = common.read_command_line(Config, __doc__, "sac_minitaur")
+    config = common.read_command_line(Config, __doc__)
     if config.evaluate is None:
         train(config)
     else:

@@ -377,7 +377,7 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     ours = {line.split(":")[0].strip() for line in source if "  # ours (" in line and ": " in line}
     assert ours == set(dqn_cartpole.TUTORIAL)
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "0.9"])
-    config = common.read_command_line(Config, "", "dqn_cartpole")
+    config = common.read_command_line(Config, "")
     assert config == Config(tutorial=True, gamma=0.9)
     assert (config.learning_rate_decay, config.target_update_tau, config.gamma) == (None, 1.0, 0.9)
     assert (config.value_unit, config.advantage_learning, config.observation_scaling) == (False, 0.0, False)
@@ -385,7 +385,7 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     with pytest.raises(ValueError, match="tutorial"):
         Config(tutorial="no")
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "1"])
-    assert common.read_command_line(Config, "", "dqn_cartpole") == Config(tutorial=True)
+    assert common.read_command_line(Config, "") == Config(tutorial=True)
 
 
 def test_a_flag_is_judged_beside_the_saved_values(monkeypatch, tmp_path):
@@ -394,7 +394,7 @@ def test_a_flag_is_judged_beside_the_saved_values(monkeypatch, tmp_path):
     torch.save(saved | {"config": common.plain_config(Config(tutorial=True))}, path := tmp_path / "policy.pt")
     for flags in (["--evaluate", str(path), "--gamma", "1"], ["--gamma=1", f"--evaluate={path}"]):
         monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", *flags])
-        assert common.read_command_line(Config, "", "dqn_cartpole") == Config(tutorial=True, evaluate=path)
+        assert common.read_command_line(Config, "") == Config(tutorial=True, evaluate=path)
 
 
 def test_only_cartpoles_own_version_warning_is_silenced():

@@ -43,7 +43,7 @@ def refusal(script, *arguments):
     """The one line that refuses this command line."""
     argv = mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)])
     with argv, pytest.raises(common.InputError, match="^[^\n]*$") as error:
-        common.read_command_line(importlib.import_module(script).Config, "", script)
+        common.read_command_line(importlib.import_module(script).Config, "")
     return str(error.value)
 
 

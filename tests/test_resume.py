@@ -278,7 +278,7 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
     """In one line that names the field."""
     module = importlib.import_module(script)
     monkeypatch.setattr(sys, "argv", [f"{script}.py", "--resume", str(reference)])
-    config = common.read_command_line(module.Config, "", script)
+    config = common.read_command_line(module.Config, "")
     others = {"device": "auto", "tutorial": True, "max_episode_steps": 77, "run_dir": Path("x"), "env_id": "x"}
     for field in set(vars(config)) - {"resume", "evaluate"}:
         value = getattr(config, field)
