@@ -72,7 +72,7 @@ def run_main(main):
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     # TensorBoard's thread would print a traceback about a full disk, which the main thread reports anyway.
     hook = threading.excepthook
-    threading.excepthook = lambda thread: isinstance(thread.exc_value, OSError) or hook(thread)
+    threading.excepthook = lambda thread: "tensorboard" in type(thread.thread).__module__ or hook(thread)
     try:
         return main()
     except (InputError, RunError) as error:
@@ -171,17 +171,6 @@ def empty_replay(capacity, columns, device):
     except (RuntimeError, TypeError):  # the latter for a number beyond 64 bits
         size = f"{capacity * columns * 4 / 1e9:.1f} GB"
         raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
-
-
-def replay_state(buffer):
-    """A copy of the filled part of a script's `ReplayBuffer`, for a checkpoint."""
-    return {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
-
-
-def restore_replay(buffer, state):
-    """Fills a new `ReplayBuffer`. Raises RuntimeError when the rows do not fit."""
-    buffer.size, buffer.position = len(state["rows"]), state["position"]
-    buffer.rows[: buffer.size] = state["rows"]
 
 
 def episode_seed(*key):
@@ -301,7 +290,8 @@ def start_worker(task=None):
     """
     start_worker.task = task
     torch.set_num_threads(1)
-    np.random.seed()  # a task may use this generator: forked, all workers would draw the same
+    np.random.seed()  # a task may use these generators: forked, all workers would draw the same
+    torch.seed()
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
         signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else lambda *_: None)
@@ -422,7 +412,7 @@ class Environments:
             with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
         for process in getattr(self.vector, "processes", []):
-            process.join(2)
+            process.join(10)  # a simulator may take seconds to end
             process.kill()
             process.join()
             self.vector.closed = True
@@ -493,7 +483,7 @@ class Run:
     def __init__(self, config, script, task, evaluate):
         """`evaluate(policy, task, seed)` plays one episode in a worker process and returns its return and length."""
         if multiprocessing.current_process().daemon:
-            raise InputError("a process of a multiprocessing.Pool cannot train: use multiprocessing.Process")
+            raise InputError("a daemon, as a Pool's worker is, cannot train: use multiprocessing.Process(daemon=False)")
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
         self.ranks, self.checkpoint = Ranks.join(), {}
         self.writes = self.ranks.rank == 0
@@ -511,6 +501,7 @@ class Run:
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
         self.tables = self.found["tables"]
+        self.texts = {table: io.StringIO() for table in self.tables}  # of the CSVs
         self.started = time.perf_counter() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
@@ -570,7 +561,8 @@ class Run:
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
-        program = Path(getattr(module, "__file__", f"{self.script}.py")).name
+        file = Path(getattr(module, "__file__", f"{self.script}.py"))
+        program = file.name if Path(file.name).exists() else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):
@@ -596,9 +588,11 @@ class Run:
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
         if saved:
             own = saved["ranks"][self.ranks.rank]
+            replay = own["buffer"]
+            buffer.size, buffer.position = len(replay["rows"]), replay["position"]
             try:
                 agent.load_state_dict(saved["agent"])
-                restore_replay(buffer, own["buffer"])
+                buffer.rows[: buffer.size] = replay["rows"]
             except RuntimeError:
                 raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
@@ -674,10 +668,11 @@ class Run:
             for name, value in row.items():
                 if name != "step" and math.isfinite(value):
                     self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
-        if rows := self.tables[table]:
-            writer = csv.DictWriter(text := io.StringIO(), rows[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        if new:
+            writer = csv.DictWriter(text := self.texts[table], new[0], lineterminator="\n")
+            if not text.tell():
+                writer.writeheader()
+            writer.writerows(new)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
 
     def log_training(self, step, env_steps, environments, metrics):
@@ -743,8 +738,8 @@ class Run:
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        own = {"buffer": replay_state(buffer), "environments": environments.state_dict(), "random": random}
-        ranks = self.ranks.gather(own)
+        replay = {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
+        ranks = self.ranks.gather({"buffer": replay, "environments": environments.state_dict(), "random": random})
         if not self.writes:
             return
         require_finite(agent, step)
@@ -836,6 +831,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
         policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
     except RuntimeError:
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
+    torch.set_num_threads(1)  # as in a run's evaluation: the same digits
     seeds, video = evaluation_seeds(config), config.evaluate.with_suffix(".mp4").absolute()
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
     try:
@@ -883,6 +879,8 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
     from PIL import Image, ImageDraw, ImageFont
 
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
+    if sys.platform == "linux" and "DISPLAY" not in os.environ:
+        os.environ.setdefault("MUJOCO_GL", "egl")  # nor does MuJoCo then
 
     def frame(caption):
         image = Image.fromarray(env.render())

@@ -187,7 +187,8 @@ def to_bounds(action, low, high):
 def require_finite(actions):
     """Raises RunError unless all actions are finite, before the task sees them."""
     if not np.isfinite(actions).all():
-        raise common.RunError("the actor's actions are not finite: learning diverged; a smaller learning rate may help")
+        why = "learning diverged (a smaller learning rate may help), or the observation was not finite"
+        raise common.RunError(f"the actor's actions are not finite: {why}")
 
 
 class ReplayBuffer:
@@ -292,7 +293,8 @@ class SACAgent(nn.Module):
             variance = (rewards - mean).square().mean()
             self.ranks.average([variance])
             std = variance.sqrt()
-            self.reward_scale /= torch.where(std > 1e-6, std, 1.0)  # rewards that were all equal stay as they are
+            # Rewards that were all equal stay as they are: their std is 0 but for rounding.
+            self.reward_scale /= torch.where(std > 1e-6 * mean.abs(), std, 1.0)
 
     @torch.no_grad()
     def act(self, observations, deterministic):

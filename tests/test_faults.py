@@ -255,6 +255,13 @@ def test_a_command_that_fails_in_a_notebook_leaves_the_kernel(error, status, mon
     assert exit.value.code == status
 
 
+def test_an_error_in_a_tasks_own_thread_is_shown(monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", shown := mock.Mock())
+    thread = threading.Thread(target=open, args=("nowhere",))
+    common.run_main(lambda: (thread.start(), thread.join()))
+    assert isinstance(shown.call_args[0][0].exc_value, FileNotFoundError)
+
+
 def test_one_directory_for_two_runs_that_start_at_once(tmp_path):
     (tmp_path / "ready").mkdir()
     hook = partial(wait_for_the_other, path=tmp_path / "ready")
@@ -380,22 +387,24 @@ def test_console_that_cannot_show_everything(script, encoding):
 
 
 def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
-    """The hint after a stop names it and quotes the path. A notebook's backend and console do not matter."""
+    """The hint after a stop names it, from any directory. A notebook's backend and console do not matter."""
     shutil.copy(ROOT / "dqn_cartpole.py", tmp_path / "my dqn.py")
+    (here := tmp_path / "elsewhere").mkdir()
     environ = os.environ | {
         "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0", "PYTHONIOENCODING": "cp437",
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
     }  # fmt: skip
     arguments = flags("dqn_cartpole", "a run", "--num-iterations", 10**6)
-    command = [sys.executable, "my dqn.py", *arguments]
-    process = subprocess.Popen(command, env=environ, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
-    wait_until((tmp_path / "a run" / "train.csv").exists, 60)
+    command = [sys.executable, "../my dqn.py", *arguments]
+    process = subprocess.Popen(command, env=environ, cwd=here, stdout=subprocess.PIPE, text=True)
+    wait_until((here / "a run" / "train.csv").exists, 60)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 0 and "warning" not in output
-    assert (tmp_path / "a run" / "learning_curve.png").stat().st_size > 0
+    assert (here / "a run" / "learning_curve.png").stat().st_size > 0
     hint = output.splitlines()[-1].partition("checkpoint: ")[2]
-    assert shlex.split(hint) == ["python", "my dqn.py", "--resume", "a run"]
+    python, program, *rest = shlex.split(hint)
+    assert python == "python" and (here / program).samefile(tmp_path / "my dqn.py") and rest == ["--resume", "a run"]
 
 
 def test_dead_environment_worker(tmp_path):

@@ -230,8 +230,9 @@ def test_observations_are_stored_as_they_are_returned(kind, scale, monkeypatch, 
     assert rows[:, 0].unique().tolist() == [0, scale, 2 * scale, 3 * scale]
 
 
-def test_a_task_that_draws_from_numpys_own_generator_draws_anew_in_every_worker(monkeypatch, tmp_path):
-    monkeypatch.setattr(Echo, "_observation", lambda self: np.random.rand(2))
+@pytest.mark.parametrize("draw", [np.random.rand, torch.rand])
+def test_a_task_that_draws_from_a_librarys_own_generator_draws_anew_in_every_worker(draw, monkeypatch, tmp_path):
+    monkeypatch.setattr(Echo, "_observation", lambda self: np.asarray(draw(2)))
     path, _ = train(tmp_path / "run", **SHORT, **IDS, num_envs=3)
     rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
     assert len(rows[:, 0].unique()) == len(rows)
