@@ -358,7 +358,7 @@ def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     assert vars(Config(tutorial=True)) == vars(Config(**TUTORIALS)) | {"tutorial": True}
     given = {"adam_beta1": 0.7, "reward_scaling": True}  # counts beside it
     config = Config("Pendulum-v1", **given, tutorial=True)
-    assert vars(config) == vars(Config("Pendulum-v1", **TUTORIALS | given)) | {"tutorial": True}
+    assert vars(config) == vars(Config(env_id="Pendulum-v1", **TUTORIALS | given)) | {"tutorial": True}
     assert all(getattr(Config(), name) != value for name, value in TUTORIALS.items())
     with pytest.raises(ValueError, match="tutorial"):
         Config(tutorial="no")  # not True, but not False either
