@@ -669,7 +669,7 @@ class Run:
                 if name != "step" and math.isfinite(value):
                     self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
         if new:
-            writer = csv.DictWriter(text := self.texts[table], new[0], lineterminator="\n")
+            writer = csv.DictWriter(text := self.texts[table], self.tables[table][0], lineterminator="\n")
             if not text.tell():
                 writer.writeheader()
             writer.writerows(new)
