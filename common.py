@@ -112,7 +112,7 @@ def complete_config(given, config_class, tutorial, script):
             rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
             if others := rest.keys() ^ names:
                 raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
-        elif policy := values.get("evaluate"):
+        elif policy := values.get("evaluate"):  # it may be older than a fork's field
             rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
     return ArgsKwargs((), rest | values)
 
@@ -411,8 +411,9 @@ class Environments:
         for pipe in getattr(self.vector, "parent_pipes", []):
             with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
+        deadline = time.perf_counter() + 10  # for all together: a simulator may take seconds to end
         for process in getattr(self.vector, "processes", []):
-            process.join(10)  # a simulator may take seconds to end
+            process.join(max(0, deadline - time.perf_counter()))
             process.kill()
             process.join()
             self.vector.closed = True
@@ -501,7 +502,7 @@ class Run:
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
         self.tables = self.found["tables"]
-        self.texts = {table: io.StringIO() for table in self.tables}  # of the CSVs
+        self.texts = {table: io.StringIO() for table in self.tables}  # the CSVs', so that a row is formatted once
         self.started = time.perf_counter() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
@@ -562,7 +563,7 @@ class Run:
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
         file = Path(getattr(module, "__file__", f"{self.script}.py"))
-        program = file.name if Path(file.name).exists() else str(file)
+        program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):

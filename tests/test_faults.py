@@ -386,16 +386,19 @@ def test_console_that_cannot_show_everything(script, encoding):
     assert result.returncode == 0 and b"--num-iterations" in result.stdout, result.stderr
 
 
-def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
-    """The hint after a stop names it, from any directory. A notebook's backend and console do not matter."""
-    shutil.copy(ROOT / "dqn_cartpole.py", tmp_path / "my dqn.py")
-    (here := tmp_path / "elsewhere").mkdir()
+@pytest.mark.parametrize("program", ["my dqn.py", "../my dqn.py"])
+def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
+    """The hint after a stop names it and quotes the path. A notebook's backend and console do not matter."""
+    (here := tmp_path / "here").mkdir()
+    shutil.copy(ROOT / "dqn_cartpole.py", here / program)
+    if program != "my dqn.py":
+        (here / "my dqn.py").write_text("another file of this name")
     environ = os.environ | {
         "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0", "PYTHONIOENCODING": "cp437",
         "MPLBACKEND": "module://matplotlib_inline.backend_inline",
     }  # fmt: skip
     arguments = flags("dqn_cartpole", "a run", "--num-iterations", 10**6)
-    command = [sys.executable, "../my dqn.py", *arguments]
+    command = [sys.executable, program, *arguments]
     process = subprocess.Popen(command, env=environ, cwd=here, stdout=subprocess.PIPE, text=True)
     wait_until((here / "a run" / "train.csv").exists, 60)
     process.send_signal(signal.SIGINT)
@@ -403,8 +406,8 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(tmp_path):
     assert process.returncode == 0 and "warning" not in output
     assert (here / "a run" / "learning_curve.png").stat().st_size > 0
     hint = output.splitlines()[-1].partition("checkpoint: ")[2]
-    python, program, *rest = shlex.split(hint)
-    assert python == "python" and (here / program).samefile(tmp_path / "my dqn.py") and rest == ["--resume", "a run"]
+    named = program if program == "my dqn.py" else f"{here}/{program}"
+    assert shlex.split(hint) == ["python", named, "--resume", "a run"]
 
 
 def test_dead_environment_worker(tmp_path):

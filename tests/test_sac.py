@@ -332,7 +332,7 @@ def test_only_the_critics_see_the_end_of_a_longer_observation():
 
 @pytest.mark.parametrize(
     "rewards, scale",
-    [([-0.001, 0.005], 6 / 0.003), (1000 * [0.0], 6), (1000 * [0.1], 6), (1000 * [-16.3], 6)],
+    [([-0.001, 0.005], 6 / 0.003), (1000 * [0.0], 6), (1000 * [0.1], 6), (1000 * [1.0], 6), (1000 * [-16.3], 6)],
 )
 def test_fit_reward_scale(rewards, scale):
     """Rewards as the Minitaur's; those that are all equal stay as they are."""

@@ -364,8 +364,10 @@ def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, ca
     assert main(monkeypatch, "--resume", path, "--num-iterations", 25) == 0
     assert checkpoint(path)["step"] == 25
     assert checkpoint(path)["config"]["seed"] == 3
-    again = Config(resume=str(path), num_iterations=30)  # the rest is the run's
+    again = Config(**TINY | SHORT | IDS | choices | {"num_iterations": 30}, resume=str(path))
     assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 30
+    again = Config(resume=str(path), num_iterations=35)  # the rest is the run's
+    assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 35
 
 
 def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path, capsys):
