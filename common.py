@@ -24,6 +24,7 @@ import tempfile
 import threading
 import time
 import traceback
+import warnings
 import zipfile
 import zlib
 from collections import deque
@@ -65,7 +66,7 @@ class TaskError(Exception):
 
 
 def run_main(main):
-    """Calls `main`. An `InputError` or a `RunError` becomes one line on stderr and the exit status 2 or 1."""
+    """Calls `main`. An error becomes its message on stderr and the exit status 2 (`InputError`) or 1."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
@@ -75,11 +76,11 @@ def run_main(main):
     threading.excepthook = lambda thread: "tensorboard" in type(thread.thread).__module__ or hook(thread)
     try:
         return main()
-    except (InputError, RunError) as error:
+    except (InputError, RunError, TaskError) as error:
         if os.environ.get("RANK", "0") != "0":
             time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
-        status = 1 if isinstance(error, RunError) else 2
+        status = 2 if isinstance(error, InputError) else 1
     except KeyboardInterrupt:
         status = 130
     if dist.is_initialized():
@@ -366,6 +367,8 @@ class Environments:
             with telling_task_errors():
                 return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
 
+        # It would show a task's error once more for each process.
+        warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)

@@ -429,6 +429,20 @@ def kill_environment(module):
     gym.vector.AsyncVectorEnv.step_async = step_async
 
 
+def test_an_error_of_the_task_is_shown_once(script, tmp_path):
+    run = Process(script, flags(script, tmp_path / "run", "--num-envs", 2), tmp_path / "output", lose_the_server)
+    assert run.wait() == 1 and "--resume" in run.stdout
+    assert run.stderr.startswith("error: the task failed: no server\nTraceback")
+    assert run.stderr.strip().endswith("\nConnectionError: no server") and run.stderr.count("Traceback") == 1
+
+
+def lose_the_server(module):
+    def lose():
+        raise ConnectionError("no server")
+
+    before_call(common.SeededEpisodes, "_checked", 30, lose)
+
+
 def test_dead_evaluation_worker(script, tmp_path):
     """With a network larger than a pipe: what is queued for the dead one must not hold up the end."""
     large = ["--layers" if script == "dqn_cartpole" else "--actor-layers", 256, 256, "--num-eval-episodes", 20]
