@@ -103,8 +103,8 @@ Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
 def complete_config(given, config_class, tutorial, script):
-    """What `Config` is given. The rest is that of the run to resume, of the run that saved the policy to evaluate, or
-    with `tutorial=True` the values in `tutorial`. Raises InputError when a file is no good."""
+    """What `Config` is given, completed from the run to resume, from the policy to evaluate, or with `tutorial=True`
+    from `tutorial`. Raises InputError when a file is no good."""
     names = config_class.__dataclass_fields__.keys()
     values = dict(zip(names, given.args or ())) | (given.kwargs or {})
     rest = tutorial if values.get("tutorial") else {}
@@ -174,14 +174,14 @@ def empty_replay(capacity, columns, device):
         raise InputError(f"--replay-buffer-capacity {capacity} takes {size}, more than is free: use less") from None
 
 
-def episode_seed(*key):
+def derive_seed(*key):
     """A 32-bit seed from integers: (seed, env index, episode number) for an episode, (seed, rank) for a process."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 def evaluation_seeds(config):
     """The seeds of the episodes that every evaluation of a run plays."""
-    return [episode_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
+    return [derive_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
 
 
 class Ranks:
@@ -316,7 +316,7 @@ class SeededEpisodes(gym.Wrapper):
     def reset(self, **_):
         replay, self.actions, self.total = self.actions, [], 0.0
         with telling_task_errors():
-            observation, _ = self.env.reset(seed=episode_seed(*self.key, self.episode))
+            observation, _ = self.env.reset(seed=derive_seed(*self.key, self.episode))
             observation = self._checked(observation)
         for action in replay:
             observation, _, terminated, truncated, _ = self.step(action)
@@ -386,7 +386,7 @@ class Environments:
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). Where an episode ended, the last is its own last one, not the first of the next."""
+        observations (K, O). Where an episode ended, these are its own last ones, not the first of the next."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
@@ -584,10 +584,10 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint or saves a first one, begins the files, and plays the episodes with random actions.
+        """Restores the checkpoint or saves a first one, begins the files, and evaluates the random policy.
 
-        Returns the gradient updates and the environment steps done so far. There is no directory before this, when all
-        that the user gave has been found usable.
+        Returns the gradient updates and the environment steps done so far. Nothing was written before: here all that
+        the user gave has been found usable.
         """
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
         if saved:
@@ -767,7 +767,7 @@ class Run:
     def finish(self, step, env_steps, agent, buffer, environments, observation_space):
         """Saves and evaluates once more, draws the curve, exports and films the policy, and says where everything lies.
 
-        What fails costs a line. After a stop it only saves, draws the curve and says how to continue.
+        A failure is a warning. After a stop it only saves, draws the curve and says how to continue.
         """
         if step > self.saved_step or self.stopped:
             self.save(step, env_steps, agent, buffer, environments)
@@ -805,7 +805,7 @@ class Run:
 
 @contextlib.contextmanager
 def or_warn(what, say):
-    """Makes a failure of what is nice to have cost a line."""
+    """Turns an exception into a printed warning."""
     try:
         yield
     except Exception as error:

@@ -57,7 +57,7 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): Q = (mean r + mean |r| × output) / (1 − γ), r of the first steps
+    value_unit: bool = True  # ours (theirs: no): Q starts near mean r / (1 − γ), r of the first steps: `fit_scaling`
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -108,7 +108,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds that are over 200 times as wide as the observations (N, O): none of CartPole's."""
+        """Drops bounds so wide that the observations (N, O) would be scaled to below 1/200: none of CartPole's."""
         largest = (observations - self.center).abs().amax(0)
         ranks.average([largest])  # in place, over the processes
         beyond = self.half_range > 200 * largest
@@ -310,7 +310,7 @@ def train(config):
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
-        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
+        torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         # Random actions first. The scales are fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):

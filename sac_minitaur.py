@@ -421,7 +421,7 @@ def train(config):
         state_size = envs.observation_size  # S, with the privileged numbers
         agent = SACAgent(config, observation_space, action_space, state_size, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
-        torch.manual_seed(common.episode_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
+        torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
         # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
         while env_steps < config.initial_collect_steps and not run.stop_requested(step):
@@ -503,7 +503,7 @@ class MinitaurBulletEnv(gym.Env):
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
     orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
-    Reward: metres forward in this step less 0.005 × 0.002 s × |observed torques · motor velocities| in W.
+    Reward: metres forward in this step less 0.005 × |observed torques · motor velocities| in W × 0.002 s, not 0.01 s.
     Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
     """
 

@@ -656,8 +656,8 @@ def test_evaluate_plays_one_seeded_episode_in_the_tasks_units():
 
 
 def test_evaluation_episodes_are_none_of_trainings():
-    evaluation = {common.episode_seed(0, common.EVALUATION_KEY, episode) for episode in range(100)}
-    training = {common.episode_seed(0, env, episode) for env in range(100) for episode in range(100)}
+    evaluation = {common.derive_seed(0, common.EVALUATION_KEY, episode) for episode in range(100)}
+    training = {common.derive_seed(0, env, episode) for env in range(100) for episode in range(100)}
     assert len(evaluation) == 100 and len(training) == 10_000 and not evaluation & training
 
 
