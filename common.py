@@ -66,7 +66,7 @@ class TaskError(Exception):
 
 
 def run_main(main):
-    """Calls `main`. One of the errors above becomes its message on stderr and the exit status 2 (`InputError`) or 1."""
+    """Calls `main`. The errors above become their message on stderr and the exit status 2 (`InputError`) or 1."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
@@ -386,7 +386,7 @@ class Environments:
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). Where an episode ended, its next observation is its own last one, not the next one's first."""
+        observations (K, O). Where an episode ended, the next observation is its last, not the first of the next."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
