@@ -80,17 +80,19 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_ablation(base, step):
-    """Returns after `step` updates of `base` and of the runs without one choice, with the seeds of all."""
-    without = f"{base}_without_"
-    names = {path.name.removeprefix(without): path.name for path in sorted(RESULTS.glob(f"{without}*"))}
+def print_sac_ablation(base, without, steps):
+    """Median returns of `base` and of the runs without one choice after these updates, with the seeds of all."""
+    names = {path.name.removeprefix(without): path.name for path in RESULTS.glob(f"{without}*")}
     curves = {label: runs(name) for label, name in ({"nothing": base} | names).items()}
     seeds = sorted(set.intersection(*map(set, curves.values())))
-    print(f"\n### {base} at {step}, without one choice\n\n| without | seed {' | '.join(map(str, seeds))} | median |")
-    print(f"|{' --- |' * (len(seeds) + 2)}")
+    print(f"\n### {base}, without one choice, medians of seeds {', '.join(map(str, seeds))}\n")
+    print(f"| without | {' | '.join(map(str, steps))} |\n|{' --- |' * (len(steps) + 1)}")
+    rows = {}
     for label, evaluations in curves.items():
-        returns = [returns_by_step(evaluations[seed])[step] for seed in seeds]
-        print(f"| {label} | {' | '.join(map(number, returns))} | {median(returns):.2f} |")
+        at = [returns_by_step(evaluations[seed]) for seed in seeds]
+        rows[label] = [median(returns[step] for returns in at) for step in steps]
+    for label, medians in sorted(rows.items(), key=lambda row: -row[1][-1]):
+        print(f"| {label} | {' | '.join(number(value, 1) for value in medians)} |")
 
 
 def print_dqn_ablation(base):
@@ -138,8 +140,7 @@ def main():
             print_table(name, goal=3_000, late=50_000)
         elif name.startswith("sac") and "_without_" not in name:
             print_table(name, goal=15, late=50_000)
-    print_ablation("sac_20000", 20_000)
-    print_ablation("sac_unaveraged", 20_000)
+    print_sac_ablation("sac_minitaur", "sac_50000_without_", (10_000, 20_000, 30_000, 50_000))
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
