@@ -155,12 +155,12 @@ def checkpoint(run_dir):
     return torch.load(run_dir / "checkpoint.pt", weights_only=True)
 
 
-def load_policy(run_dir):
-    """The policy that `--evaluate` reads."""
+def load_policy(path):
+    """The policy that `--evaluate` reads from this file."""
     import gymnasium as gym
     import torch
 
-    file = torch.load(run_dir / "policy.pt", weights_only=True)
+    file = torch.load(path, weights_only=True)
     module = importlib.import_module(file["script"])
     config = module.Config(**file["config"])
     with gym.make(config.env_id) as env:

@@ -1,4 +1,4 @@
-"""The Minitaur against pybullet's own class, bit for bit, and against what gymnasium and Stable-Baselines3 expect."""
+"""The Minitaur against pybullet's own class, bit for bit, and against what gymnasium expects."""
 
 import contextlib
 import dataclasses
@@ -28,11 +28,6 @@ def trot(step, frequency=2.0, swing=0.5, extension=0.3):
     """Diagonal legs in phase, without looking at the robot: it walks slowly and stays up for a whole episode."""
     phase = 2 * math.pi * frequency * step * 0.01 + np.array([0, math.pi, math.pi, 0])
     return np.concatenate((swing * np.sin(phase), extension * np.cos(phase)))
-
-
-def reckless_trot(step):
-    """Walks for some hundred steps and tends to fall."""
-    return trot(step, frequency=1.5, swing=0.65, extension=0.45)
 
 
 def crouch(step):
@@ -150,13 +145,6 @@ def test_equals_the_original_over_a_whole_walk(pair):
     steps, fell_at, _ = pair.play(0, trot, np.float32)
     assert steps == 1000 and fell_at is None  # so the time limit ended it
     assert pair.env.unwrapped.x > 1  # and it was a walk
-
-
-@numpy_2
-def test_equals_the_original_in_a_fall_after_a_walk(pair):
-    # After 202 and 366 steps where this was written; the last bit of another machine's sine may change that.
-    falls = [pair.play(seed, reckless_trot, np.float32, num_steps=400)[1] for seed in (1, 3)]
-    assert any(fell_at is not None and fell_at > 100 for fell_at in falls)
 
 
 def test_equals_the_original_walking_with_float64_actions(pair):
@@ -341,13 +329,6 @@ def test_passes_gymnasiums_check():
         check_env(gym.make(ENV_ID).unwrapped)
 
 
-def test_passes_stable_baselines_check():
-    env_checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env_checker.check_env(gym.make(ENV_ID, render_mode="rgb_array"))  # its render check closes the environment
-
-
 def test_renders_without_a_display(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with gym.make(ENV_ID, render_mode="rgb_array") as env:
@@ -396,14 +377,10 @@ keep.itself = keep
 def test_other_tasks_need_no_pybullet(tmp_path):
     code = """
 import sys
-
-class Block:
-    def find_spec(self, name, path=None, target=None):
-        if name.startswith("pybullet"):
-            raise ImportError("No module named " + name)
-
-sys.meta_path.insert(0, Block())
+sys.modules.update(dict.fromkeys(("pybullet", "pybullet_data", "pybullet_utils")))  # an import of these raises
 import gymnasium as gym
+import dqn_cartpole
+assert "sac_minitaur" not in sys.modules
 import common, sac_minitaur
 task, *_ = common.find_task(sac_minitaur.Config(env_id="Pendulum-v1"), gym.spaces.Box)
 env = sac_minitaur.make_training_env(task, privileged=True)
@@ -416,4 +393,4 @@ except common.InputError as error:
 """
     process = run_python(code, tmp_path)
     assert process.returncode == 0, process.stderr
-    assert process.stdout == f"--env-id {ENV_ID} cannot be made: No module named pybullet\n"
+    assert process.stdout == f"--env-id {ENV_ID} cannot be made: import of pybullet halted; None in sys.modules\n"

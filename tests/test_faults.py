@@ -28,8 +28,8 @@ import torch
 
 import common
 import dqn_cartpole
-from runs import ROOT, SCRIPTS, Process, assert_same_run, before_call, before_update, checkpoint, die, finish, flags
-from runs import interrupt, load_policy, rows, session, wait_until
+from runs import ROOT, SCRIPTS, Process, assert_same, assert_same_run, before_call, before_update, checkpoint, die
+from runs import finish, flags, interrupt, load_policy, rows, session, wait_until
 
 
 def assert_one_line(run, status, *words):
@@ -148,18 +148,40 @@ def test_a_network_that_was_changed_since(script, copy, tmp_path):
 
 
 def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
-    """Its file says on what task and on which episodes. The exported one does the same."""
+    """Its file says on what task and on which episodes. Other episodes may be chosen."""
     run = finish(script, ["--evaluate", reference / "policy.pt", "--no-video"], tmp_path / "output")
     header, *_, last = rows(reference / "eval.csv")
     assert f"AverageReturn = {float(last[header.index('average_return')]):.6f} " in run.stdout
     other_task = ["--evaluate", reference / "policy.pt", "--no-video", "--env-id"]
     other_task.append("MountainCar-v0" if script == "dqn_cartpole" else "MountainCarContinuous-v0")
     assert_one_line(Process(script, other_task, tmp_path / "other"), 2, "policy.pt", "does not fit MountainCar")
+    more = ["--num-eval-episodes", 1, "--seed", 9]
+    run = finish(script, ["--evaluate", reference / "best_policy.pt", "--no-video", *more], tmp_path / "one")
+    assert "+/- 0.000000, Average" in run.stdout
 
-    policy, exported = load_policy(reference), torch.export.load(reference / "policy.pt2").module()
-    for batch in (1, 7, 300):
-        observations = torch.randn(batch, 4 if script == "dqn_cartpole" else 3)
-        assert torch.equal(policy(observations), exported(observations))
+
+def test_exported_policies_run_without_this_project(script, reference, tmp_path):
+    batches = [torch.randn(size, 4 if script == "dqn_cartpole" else 3) for size in (1, 2, 300)]
+    torch.save(batches, tmp_path / "batches.pt")
+    code = """
+import sys, torch
+for name in ("policy", "best_policy"):
+    policy = torch.export.load(f"{sys.argv[1]}/{name}.pt2").module()
+    torch.save([policy(batch) for batch in torch.load("batches.pt")], f"{name}.pt")
+assert not {"sac_minitaur", "dqn_cartpole", "common", "gymnasium"} & set(sys.modules)
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    command = [sys.executable, "-c", code, reference]
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    for name in ("policy.pt", "best_policy.pt"):
+        policy = load_policy(reference / name)
+        for batch, actions in zip(batches, torch.load(tmp_path / name), strict=True):
+            torch.testing.assert_close(actions, policy(batch).detach(), rtol=1e-6, atol=1e-6)
+        assert len(actions) == 300 and len(actions.unique()) == (2 if script == "dqn_cartpole" else 300)
+    weights = load_policy(reference / "policy.pt").state_dict()
+    trained = checkpoint(reference)["agent"]
+    assert_same(dict(weights), {name: trained[f"policy.{name}"] for name in weights})
 
 
 @pytest.fixture
@@ -345,6 +367,7 @@ def test_trains_on_without_a_console(tmp_path, hook):
 @pytest.mark.parametrize("hook", [replace_stderr, have_no_streams])
 def test_evaluates_without_a_console(script, copy, tmp_path, hook):
     assert not finish(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", hook).stderr
+    assert (copy / "policy.mp4").exists()
 
 
 def test_evaluates_onto_a_full_disk(script, copy, tmp_path):
@@ -383,7 +406,8 @@ def test_console_that_cannot_show_everything(script, encoding):
     command = [sys.executable, ROOT / f"{script}.py", "--help"]
     environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
     result = subprocess.run(command, env=environ, capture_output=True)
-    assert result.returncode == 0 and b"--num-iterations" in result.stdout, result.stderr
+    assert result.returncode == 0 and not result.stderr, result.stderr
+    assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
 
 
 @pytest.mark.parametrize("program", ["my dqn.py", "../my dqn.py"])
@@ -412,21 +436,13 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
 
 def test_dead_environment_worker(tmp_path):
     arguments = flags("sac_minitaur", tmp_path / "run", "--num-envs", 2)
-    run = Process("sac_minitaur", arguments, tmp_path / "output", kill_environment)
+    run = Process("sac_minitaur", arguments, tmp_path / "output", partial(before_step, action=die))
     assert_one_line(run, 1, "worker process died", "--resume")
     assert checkpoint(tmp_path / "run")["step"] == 0
 
 
-def kill_environment(module):
-    step = gym.vector.AsyncVectorEnv.step_async
-    calls = iter(range(100))
-
-    def step_async(self, actions):
-        step(self, actions)
-        if next(calls) == 30:
-            os.kill(self.processes[1].pid, signal.SIGKILL)
-
-    gym.vector.AsyncVectorEnv.step_async = step_async
+def before_step(module, action):
+    before_call(common.SeededEpisodes, "step", 30, action)
 
 
 def test_an_error_of_the_task_is_shown_once(script, tmp_path):
@@ -498,11 +514,11 @@ def train_in_a_pool(module):
     module.main = main
 
 
-def test_films_both_agents_without_a_display(script, tmp_path):
+def test_films_without_a_display(script, tmp_path):
     arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
     run = Process(script, arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
     assert run.wait() == 0 and not run.stderr, run.stderr
-    for name in ("trained_agent.mp4", "random_agent.mp4"):
+    for name in ("trained_agent.mp4", "random_agent.mp4", "learning.mp4"):
         with imageio.get_reader(tmp_path / "run" / name) as video:
             frames = [np.asarray(frame) for frame in video]
         assert len(frames) > 5 and frames[0].std() > 0 and (frames[0] != frames[-1]).any()
@@ -535,9 +551,9 @@ class Blinking(gym.Env):
         Blinking.closed += 1
 
 
-def film(path, **arguments):
+def film(path, parts=((None, None, None),), **arguments):
     task = gym.envs.registration.EnvSpec("Blinking-v0", Blinking, disable_env_checker=True, kwargs=arguments)
-    common.film([(None, None, None)], task, 0, path)
+    common.film(parts, task, 0, path)
 
 
 def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
@@ -547,6 +563,16 @@ def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
         assert video.get_meta_data()["fps"] == 40
     assert brightness == pytest.approx([24 * i for i in range(11)], abs=3)  # every third step, and the last
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_film_has_a_part_with_a_caption_for_each_policy(tmp_path):
+    policy, played = mock.Mock(), []
+    policy.act = lambda observation: played.append(policy.load_state_dict.call_args[0][0]) or 0
+    film(tmp_path / "film.mp4", [(policy, "first weights", "1"), (policy, "more", "7 updates"), (None, None, None)])
+    assert played == 30 * ["first weights"] + 30 * ["more"]
+    with imageio.get_reader(tmp_path / "film.mp4") as video:
+        first, second, third = np.float32([frame for frame in video]).reshape(3, 11, 16 * 16 * 3)
+    assert (abs(first - third).max(1) > 50).all() and (abs(second - first).max(1) > 50).all()
 
 
 def test_a_film_that_fails_leaves_nothing(tmp_path):

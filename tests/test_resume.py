@@ -6,6 +6,7 @@
 import dataclasses
 import importlib
 import io
+import json
 import math
 import multiprocessing
 import os
@@ -21,7 +22,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import gymnasium as gym
 import imageio
 import pytest
 import torch
@@ -83,10 +83,26 @@ def test_reference_is_worth_comparing_with(script, reference):
     assert any(len(actions) > 0 for _, actions in own["environments"]["episodes"])
     assert [row[0] for row in rows(reference / "eval.csv")] == ["step", "0", "100", "200", "300"]
     assert [row[0] for row in rows(reference / "train.csv")] == ["step", *map(str, range(20, 301, 20))]
+    files = {"config.json", "random.csv", "policy.pt", "policy.pt2", "best_policy.pt", "best_policy.pt2"}
+    assert files <= {path.name for path in reference.iterdir()} and list(reference.glob("events.out.tfevents.*"))
+    assert (reference / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     # The speed is that of the updates since the last row.
     first, *later = read_csv(reference / "train.csv")
     seconds = sum(20 / row["steps_per_second"] for row in later)
     assert seconds == pytest.approx(later[-1]["seconds"] - first["seconds"], abs=0.1)
+
+
+def test_the_same_seed_gives_the_same_bits(script, reference, tmp_path):
+    """Another gives other networks, actions and episodes."""
+    module = importlib.import_module(script)
+    config = json.loads((reference / "config.json").read_text())
+    assert_same_run(module.train(module.Config(**config | {"run_dir": tmp_path / "same"})), reference)
+    other = checkpoint(module.train(module.Config(**config | {"run_dir": tmp_path / "other", "seed": 1})))
+    mine = checkpoint(reference)
+    matrices = [name for name, tensor in mine["agent"].items() if tensor.dim() == 2]
+    assert matrices and not any(torch.equal(mine["agent"][name], other["agent"][name]) for name in matrices)
+    assert not torch.equal(mine["ranks"][0]["buffer"]["rows"][:, :2], other["ranks"][0]["buffer"]["rows"][:, :2])
+    assert mine["tables"]["eval"][0]["average_return"] != other["tables"]["eval"][0]["average_return"]
 
 
 def test_killed_at_every_moment_and_resumed(script, reference, tmp_path):
@@ -201,21 +217,16 @@ def play_for_ever(policy, task, seed):
     time.sleep(10**6)
 
 
-def test_second_interrupt_stops_at_once(script, tmp_path):
-    run = Process(script, flags(script, tmp_path / "run"), tmp_path / "output", interrupt_twice)
-    assert run.wait() == 130
+def test_second_interrupt_in_a_notebook(script, tmp_path):
+    """It ends the cell and no more."""
+    run = finish(script, flags(script, tmp_path / "run"), tmp_path / "output", interrupt_a_cell_twice)
+    assert run.stdout.splitlines()[-1] == "the kernel lives, with 0 workers"
     assert checkpoint(tmp_path / "run")["step"] == 0  # the second came before a checkpoint was written
 
 
 def interrupt_twice(module):
     before_update(module, 20, interrupt)
     before_call(common.Run, "save", 2, interrupt)
-
-
-def test_second_interrupt_in_a_notebook(script, tmp_path):
-    """It ends the cell and no more."""
-    run = finish(script, flags(script, tmp_path / "run"), tmp_path / "output", interrupt_a_cell_twice)
-    assert run.stdout.splitlines()[-1] == "the kernel lives, with 0 workers"
 
 
 def interrupt_a_cell_twice(module):
@@ -297,38 +308,6 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
     message = "--num-iterations 299 differs from the 300 of the run to resume: raise it"
     with pytest.raises(common.InputError, match=message):
         common.Run(dataclasses.replace(config, num_iterations=299), script, None, None)
-
-
-class Remembers(gym.ObservationWrapper):
-    """As one that normalizes its observations by all that it has seen."""
-
-    def observation(self, observation):
-        return observation + 1e-3
-
-
-class RemembersRewards(gym.RewardWrapper):
-    """As one that normalizes its rewards so. Its observations repeat."""
-
-    def reward(self, reward):
-        return reward + 1e-3
-
-
-@pytest.mark.parametrize("wrapper", (Remembers, RemembersRewards))
-def test_a_task_that_cannot_be_played_again(wrapper, script, reference, tmp_path):
-    """The user is told. In test_tasks it ends another time, too."""
-    shutil.copytree(reference, tmp_path / "run")
-    arguments = ["--resume", tmp_path / "run", "--num-iterations", 320]
-    run = finish(script, arguments, tmp_path / "output", partial(wrap, wrapper=wrapper))
-    assert "warning: an episode went differently" in run.stdout and checkpoint(tmp_path / "run")["step"] == 320
-
-
-def wrap(module, wrapper):
-    begin = common.Environments.__init__
-
-    def begin_wrapped(self, make_env, *more, **named):
-        begin(self, lambda: wrapper(make_env()), *more, **named)
-
-    common.Environments.__init__ = begin_wrapped
 
 
 def test_where_processes_are_spawned(reference, script, tmp_path):

@@ -55,13 +55,14 @@ class Echo(gym.Env):
 
 
 class Unrepeatable(Echo):
-    """Its episodes end when something outside says so, which is not the same on resume."""
+    """Its episodes end when something outside says so, which is not the same on resume. So with what it returns."""
 
-    length = 50
+    length, error_of_rewards, error_of_observations = 50, 0, 0
 
     def step(self, action):
         observation, reward, *_ = super().step(action)
-        return observation, reward, bool(self.state[0] >= self.length), False, {}
+        done = bool(self.state[0] >= self.length)
+        return observation + self.error_of_observations, reward + self.error_of_rewards, done, False, {}
 
 
 class Starts(Echo):
@@ -148,7 +149,7 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
     assert "warning: no video (Echo.__init__() got an unexpected keyword argument 'render_mode'" in output
     observations = torch.rand(5, 2)
     exported = torch.export.load(path / "policy.pt2").module()(observations)
-    assert torch.equal(exported, load_policy(path)(observations))
+    assert torch.equal(exported, load_policy(path / "policy.pt")(observations))
 
 
 @pytest.mark.parametrize(
@@ -370,11 +371,14 @@ def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, ca
     assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 35
 
 
-def test_an_episode_that_cannot_be_played_again_on_resume(monkeypatch, tmp_path, capsys):
+@pytest.mark.parametrize("change", [{"length": 5}, {"error_of_rewards": 1e-3}, {"error_of_observations": 1e-3}])
+def test_an_episode_that_cannot_be_played_again_on_resume(change, monkeypatch, tmp_path, capsys):
+    """The user is told."""
     choices = SHORT | dict(env_id=f"{__name__}:Unrepeatable-v0", replay_buffer_capacity=200)
     train(tmp_path / "run", **choices)
     assert "warning" not in capsys.readouterr().out
-    monkeypatch.setattr(Unrepeatable, "length", 5)
+    for name, value in change.items():
+        monkeypatch.setattr(Unrepeatable, name, value)
     train(tmp_path / "run", **choices | {"num_iterations": 40}, run_dir=None, resume=str(tmp_path / "run"))
     assert "warning: an episode went differently" in capsys.readouterr().out
     rows = checkpoint(tmp_path / "run")["ranks"][0]["buffer"]["rows"]
