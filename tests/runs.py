@@ -110,27 +110,16 @@ def session(leader):
     return pids
 
 
-def rank_environ(rank, world_size, port):
-    """What torchrun tells a process."""
-    return {
-        "RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": str(world_size),
-        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
-    }  # fmt: skip
-
-
-def free_port():
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
-
-
 def start_ranks(world_size, script, arguments, output, hook=None):
     """The processes of a distributed run, as torchrun would start them but without its watch over them."""
-    port = free_port()
-    return [
-        Process(script, arguments, Path(output) / str(rank), hook, **rank_environ(rank, world_size, port))
-        for rank in range(world_size)
-    ]
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        environ = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(listener.getsockname()[1])}
+    ranks = []
+    for rank in map(str, range(world_size)):
+        environ |= {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": str(world_size)}
+        ranks.append(Process(script, arguments, Path(output) / rank, hook, **environ))
+    return ranks
 
 
 def rows(path):
