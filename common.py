@@ -45,8 +45,6 @@ from pydantic_core import ArgsKwargs, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 3  # of checkpoints and policies
-# In an evaluation episode's seed this stands where training has the number of an environment.
-EVALUATION_KEY = 2**32 - 1
 # Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -181,28 +179,25 @@ def derive_seed(*key):
 
 def evaluation_seeds(config):
     """The seeds of the episodes that every evaluation of a run plays."""
-    return [derive_seed(config.seed, EVALUATION_KEY, i) for i in range(config.num_eval_episodes)]
+    no_environment = 2**32 - 1  # a number that no training environment has
+    return [derive_seed(config.seed, no_environment, i) for i in range(config.num_eval_episodes)]
 
 
 class Ranks:
     """This process among those that torchrun started. Without torchrun it is rank 0 of 1 and talks to nobody."""
 
-    def __init__(self, rank=0, world_size=1, local_rank=0):
-        self.rank, self.world_size, self.local_rank = rank, world_size, local_rank
-
-    @classmethod
-    def join(cls):
+    def __init__(self):
         """Joins the processes that torchrun's variables describe. Raises InputError when these are no good."""
-        if "RANK" not in os.environ or os.environ.get("WORLD_SIZE") == "1":
-            return cls()
-        try:
-            local_rank = int(os.environ["LOCAL_RANK"])
-            if not dist.is_initialized():
-                dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        except (KeyError, ValueError, dist.DistError) as error:
-            what = f"RANK is set but the processes cannot join: {first_line(error)}"
-            raise InputError(f"{what}; start them with torchrun, or unset RANK") from None
-        return cls(dist.get_rank(), dist.get_world_size(), local_rank)
+        self.rank, self.world_size, self.local_rank = 0, 1, 0
+        if "RANK" in os.environ and os.environ.get("WORLD_SIZE") != "1":
+            try:
+                self.local_rank = int(os.environ["LOCAL_RANK"])
+                if not dist.is_initialized():
+                    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+            except (KeyError, ValueError, dist.DistError) as error:
+                what = f"RANK is set but the processes cannot join: {first_line(error)}"
+                raise InputError(f"{what}; start them with torchrun, or unset RANK") from None
+            self.rank, self.world_size = dist.get_rank(), dist.get_world_size()
 
     def batch_share(self, config):
         """The size of this process's share of a batch. Raises InputError when the shares are not equal, or when the
@@ -220,20 +215,6 @@ class Ranks:
             dist.all_reduce(flat := torch.cat([tensor.flatten() for tensor in tensors]))
             for tensor, total in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
                 tensor.copy_(total.view_as(tensor) / self.world_size)
-
-    def share(self, value):
-        """Rank 0's value, on every rank."""
-        values = [value]
-        if self.world_size > 1:
-            dist.broadcast_object_list(values)
-        return values[0]
-
-    def gather(self, value):
-        """The list of every rank's value on rank 0, None on the others."""
-        values = [value] * self.world_size if self.rank == 0 else None
-        if self.world_size > 1:
-            dist.gather_object(value, values)
-        return values
 
 
 def find_task(config, action_space):
@@ -263,11 +244,10 @@ def find_task(config, action_space):
         needed, fits = "Discrete from 0", fits and actions.start == 0
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        floats = np.float16, np.float32, np.float64
-        fits = fits and actions.shape and 0 not in actions.shape and actions.dtype in floats
+        fits = fits and actions.dtype in (np.float16, np.float32, np.float64)
         if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
-            fits = (widths.isfinite() & (widths > 0)).all()
+            fits = actions.shape and widths.numel() and (widths.isfinite() & (widths > 0)).all()
     if not fits:
         raise InputError(f"{name} has the action space {actions}: a {needed} is needed")
     return task, observations, actions
@@ -376,7 +356,8 @@ class Environments:
         (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         self.num_episodes = np.array(self.vector.get_attr("episode"))
-        self.resumed_exactly = saved.get("fingerprint") in (None, self._fingerprint())
+        if saved.get("fingerprint") not in (None, self._fingerprint()):
+            run.print("warning: an episode went differently when it was played again: this resume is not exact")
 
     def step_async(self, actions):
         """Takes actions (K, …). Workers begin the step at once; without them `step_wait` does it."""
@@ -489,7 +470,7 @@ class Run:
         if multiprocessing.current_process().daemon:
             raise InputError("a daemon, as a Pool's worker is, cannot train: use multiprocessing.Process(daemon=False)")
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
-        self.ranks, self.checkpoint = Ranks.join(), {}
+        self.ranks, self.checkpoint = Ranks(), {}
         self.writes = self.ranks.rank == 0
         self.device = select_device(config.device, self.ranks.local_rank)
         if self.ranks.world_size > 1 and ":" in config.device:
@@ -499,7 +480,10 @@ class Run:
             self._require_same_run(self.checkpoint["config"])
         # To the microsecond, for runs that are started at once.
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
-        self.path = config.resume or config.run_dir or self.ranks.share(Path("runs") / name)
+        path = [config.resume or config.run_dir or Path("runs") / name]
+        if self.ranks.world_size > 1:
+            dist.broadcast_object_list(path)  # the others take rank 0's
+        (self.path,) = path
         self.directory = self.path.absolute()  # a task may change the current one
         # What the run has found; a snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
@@ -602,7 +586,7 @@ class Run:
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
                 optimizer.load_state_dict(state)
             torch.set_rng_state(own["random"]["cpu"])
-            if self.device.type == "cuda" and "cuda" in own["random"]:
+            if self.device.type == "cuda" and own["random"].get("cuda") is not None:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
@@ -613,8 +597,6 @@ class Run:
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
-        if not environments.resumed_exactly:
-            self.print("warning: an episode went differently when it was played again: this resume is not exact")
         step, env_steps = self.saved_step, saved.get("env_steps", 0)
         if not env_steps:  # a kill in the first steps can be resumed too
             self.save(step, env_steps, agent, buffer, environments)
@@ -654,8 +636,6 @@ class Run:
             if self.writes and sys.stdout is not None:
                 tqdm.write(line)
                 sys.stdout.flush()
-        except ValueError:
-            pass  # the stream is closed
         except OSError as error:
             if error.errno == errno.ENOSPC:
                 raise
@@ -739,11 +719,13 @@ class Run:
     def save(self, step, env_steps, agent, buffer, environments):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
         self.saved_step = step
-        random = {"cpu": torch.get_rng_state()}
-        if self.device.type == "cuda":
-            random["cuda"] = torch.cuda.get_rng_state(self.device)
+        cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
+        random = {"cpu": torch.get_rng_state(), "cuda": cuda}
         replay = {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
-        ranks = self.ranks.gather({"buffer": replay, "environments": environments.state_dict(), "random": random})
+        own = {"buffer": replay, "environments": environments.state_dict(), "random": random}
+        ranks = [own] * self.ranks.world_size if self.writes else None
+        if self.ranks.world_size > 1:
+            dist.gather_object(own, ranks)  # fills rank 0's list
         if not self.writes:
             return
         require_finite(agent, step)

@@ -64,7 +64,7 @@ def save_gradients(module, directory):
     """Makes the gradients of both scripts' agents the run."""
 
     def main():
-        ranks = common.Ranks.join()
+        ranks = common.Ranks()
         gradients = {name: gradients_of_update(sys.modules[name], ranks) for name in SCRIPTS}
         torch.save(gradients, f"{directory}/{ranks.rank}.pt")
 

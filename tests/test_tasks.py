@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -324,6 +325,14 @@ def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
     path, _ = train(tmp_path / "run", **SHORT, **IDS)
     assert signal.getsignal(signal.SIGINT) == handler and os.environ["MPLBACKEND"] == "agg"
     assert (path / "learning_curve.png").exists()
+
+
+def test_train_in_a_thread(tmp_path):
+    """It can be asked to stop in the main thread only."""
+    thread = threading.Thread(target=train, args=(tmp_path / "run",), kwargs=SHORT | IDS)
+    thread.start()
+    thread.join()
+    assert checkpoint(tmp_path / "run")["step"] == 20
 
 
 @pytest.mark.parametrize("steps", [0, 50])
