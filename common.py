@@ -636,6 +636,8 @@ class Run:
             if self.writes and sys.stdout is not None:
                 tqdm.write(line)
                 sys.stdout.flush()
+        except ValueError:
+            pass  # the stream is closed
         except OSError as error:
             if error.errno == errno.ENOSPC:
                 raise

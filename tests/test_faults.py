@@ -29,7 +29,7 @@ import torch
 import common
 import dqn_cartpole
 from runs import ROOT, SCRIPTS, Process, assert_same, assert_same_run, before_call, before_update, checkpoint, die
-from runs import finish, flags, interrupt, load_policy, rows, session, wait_until
+from runs import finish, flags, interrupt, load_policy, read_csv, rows, session, wait_until
 
 
 def assert_one_line(run, status, *words):
@@ -149,9 +149,15 @@ def test_a_network_that_was_changed_since(script, copy, tmp_path):
 
 def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
     """Its file says on what task and on which episodes. Other episodes may be chosen."""
-    run = finish(script, ["--evaluate", reference / "policy.pt", "--no-video"], tmp_path / "output")
-    header, *_, last = rows(reference / "eval.csv")
-    assert f"AverageReturn = {float(last[header.index('average_return')]):.6f} " in run.stdout
+    evaluations = read_csv(reference / "eval.csv")
+    best = max(evaluations, key=lambda row: row["average_return"])
+    for name, row in (("policy.pt", evaluations[-1]), ("best_policy.pt", best)):
+        run = finish(script, ["--evaluate", reference / name, "--no-video"], tmp_path / name)
+        spread, length = (row[f"std_{of}"] for of in ("return", "episode_length"))
+        assert run.stdout.splitlines()[-1] == (
+            f"{reference / name}: AverageReturn = {row['average_return']:.6f} +/- {spread:.6f}, "
+            f"AverageEpisodeLength = {row['average_episode_length']:.6f} +/- {length:.6f}"
+        )
     other_task = ["--evaluate", reference / "policy.pt", "--no-video", "--env-id"]
     other_task.append("MountainCar-v0" if script == "dqn_cartpole" else "MountainCarContinuous-v0")
     assert_one_line(Process(script, other_task, tmp_path / "other"), 2, "policy.pt", "does not fit MountainCar")
@@ -340,6 +346,10 @@ def close_stdout(module):
     sys.stdout = None
 
 
+def close_the_stream(module):
+    before_update(module, 50, sys.stdout.close)
+
+
 def replace_stderr(module):
     sys.stderr = SimpleNamespace(write=len, flush=lambda: None)
 
@@ -362,6 +372,11 @@ def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
     assert (tmp_path / "run" / "best_policy.pt2").exists()
+
+
+def test_trains_on_when_its_program_closes_the_stream(tmp_path):
+    run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", close_the_stream)
+    assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
 
 
 @pytest.mark.parametrize("hook", [replace_stderr, have_no_streams])

@@ -524,9 +524,11 @@ def main(monkeypatch, *arguments):
 def test_the_policy_that_readme_films(monkeypatch, capsys, tmp_path):
     pytest.importorskip("pybullet")
     path = shutil.copy(ROOT / "results" / "minitaur_policy.pt", tmp_path)
+    torch.set_num_threads(2)
     assert main(monkeypatch, "--evaluate", path, "--num-eval-episodes", 1, "--max-episode-steps", 50) == 0
     shown = re.search(r"AverageReturn = (\S+) .* = 50\.0", capsys.readouterr().out)
     assert float(shown[1]) > 0.5  # standing still has 0
+    assert torch.get_num_threads() == 1  # as in a run's evaluations: another number may round differently
     with imageio.get_reader(tmp_path / "minitaur_policy.mp4") as video:
         frames = [np.asarray(frame) for frame in video]
     assert len(frames) == 26 and (frames[0] != frames[-1]).any()
