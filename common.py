@@ -5,6 +5,7 @@ policies, curve and videos. No network, loss or replay buffer is defined here.
 """
 
 import argparse
+import atexit
 import contextlib
 import copy
 import csv
@@ -48,7 +49,7 @@ FILE_FORMAT = 3  # of checkpoints and policies
 # Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads"}
+MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads", "cuda_graph"}
 
 
 class InputError(Exception):
@@ -109,7 +110,7 @@ def complete_config(given, config_class, tutorial, script):
     if names > values.keys():  # the command line gives all of them, completed before
         if run := values.get("resume"):
             rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
-            if others := rest.keys() ^ names:
+            if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
                 raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
         elif policy := values.get("evaluate"):  # it may be older than a fork's field
             rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
@@ -194,6 +195,7 @@ class Ranks:
                 self.local_rank = int(os.environ["LOCAL_RANK"])
                 if not dist.is_initialized():
                     dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+                    atexit.register(dist.destroy_process_group)  # NCCL warns without it
             except (KeyError, ValueError, dist.DistError) as error:
                 what = f"RANK is set but the processes cannot join: {first_line(error)}"
                 raise InputError(f"{what}; start them with torchrun, or unset RANK") from None
@@ -500,7 +502,7 @@ class Run:
         config = plain_config(self.config) | {"run_dir": self.config.run_dir}  # a run cannot move
         for name, value in config.items():
             shorter = name == "num_iterations" and value < saved[name]
-            if shorter or value != saved[name] and name not in MAY_DIFFER_ON_RESUME:
+            if shorter or name not in MAY_DIFFER_ON_RESUME and value != saved[name]:
                 flag, what = f"--{name.replace('_', '-')} {value}", "raise it" if shorter else "leave it out"
                 raise InputError(f"{flag} differs from the {saved[name]} of the run to resume: {what}")
         if (processes := len(self.checkpoint["ranks"])) != self.ranks.world_size:

@@ -300,7 +300,7 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
         else:
             changed = others[field] if field in others else value + 1 if isinstance(value, int) else value / 2 or 0.5
         continued = dataclasses.replace(config, **{field: changed})
-        if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads"):
+        if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads", "cuda_graph"):
             common.Run(continued, script, None, None)
         else:
             with pytest.raises(common.InputError, match=f"^--{field.replace('_', '-')} .*: leave it out$"):
@@ -308,6 +308,23 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
     message = "--num-iterations 299 differs from the 300 of the run to resume: raise it"
     with pytest.raises(common.InputError, match=message):
         common.Run(dataclasses.replace(config, num_iterations=299), script, None, None)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_a_run_on_a_gpu_continues_exactly(script, reference, tmp_path):
+    """In one process, as in a notebook, which has used the GPU when it starts the workers. The CPU continues it too.
+
+    SAC's updates are replayed as a CUDA graph: they are those of the run without one.
+    """
+    module = importlib.import_module(script)
+    config = json.loads((reference / "config.json").read_text()) | {"device": "cuda"}
+    with_graph, without = ({"cuda_graph": value} if script == "sac_minitaur" else {} for value in (True, False))
+    whole = module.train(module.Config(**config | {"run_dir": tmp_path / "whole"}))
+    module.train(module.Config(**config | {"run_dir": tmp_path / "run", "num_iterations": 190} | with_graph))
+    run = module.train(module.Config(resume=tmp_path / "run", num_iterations=300))
+    assert_same_run(run, whole)
+    module.train(module.Config(resume=run, num_iterations=310, device="cpu", **without))
+    assert checkpoint(run)["step"] == 310
 
 
 def test_where_processes_are_spawned(reference, script, tmp_path):

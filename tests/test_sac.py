@@ -596,6 +596,7 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
         ("--env-id :y-v0", ":y-v0"),
         ("--env-id CartPole-v1", "Discrete"),
         ("--device cuda:77", "cuda:77"),
+        ("--device cpu --cuda-graph", "with a CUDA GPU: use --no-cuda-graph"),
         ("--batch-size 300", "--batch-size 300"),
         ("--replay-buffer-capacity 9000000000000000", "--replay-buffer-capacity 9000000000000000 takes 324000000.0 GB"),
         ("--replay-buffer-capacity 20", "--batch-size 32 is more than the 20"),
