@@ -72,7 +72,7 @@ def run_main(main):
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     # TensorBoard's thread would print a traceback about a full disk, which the main thread reports anyway.
     hook = threading.excepthook
-    threading.excepthook = lambda thread: "tensorboard" in type(thread.thread).__module__ or hook(thread)
+    threading.excepthook = lambda args: "tensorboard" in type(args.thread).__module__ or hook(args)
     try:
         return main()
     except (InputError, RunError, TaskError) as error:

@@ -10,9 +10,9 @@
 The Q-network estimates Q(s, a): the sum of the rewards after action a in state s, with the best actions from then on.
 Each later reward counts γ times as much as the one before. Each update moves Q(s, a) towards a target,
 r + γ max Q(s', ·): r is the reward, s' the next state, and the maximum is over all actions there. A slow copy of the
-Q-network, the target network, computes that maximum, so that the target moves slowly. Advantage learning lowers the
-target of every action but the best, which stays the best. The policy takes the action of the largest Q. While it
-collects data, some actions are random: so it explores.
+Q-network, the target network, computes that maximum, so that the target moves slowly. Advantage learning also lowers
+the targets of the worse actions, so that the best one stands out. The policy takes the action of the largest Q. While
+it collects data, some actions are random: so it explores.
 
 It reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level control
 through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks "ours", README says why.
@@ -175,7 +175,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy (K, O), (K,), (K,), (K,), (K, O). A full buffer overwrites its oldest."""
+        """Stores K transitions, numpy (K, O), (K,), (K,), (K,), (K, O). A full buffer drops its oldest."""
         columns = (observations, actions[:, None], rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
         for row in rows:
@@ -325,7 +325,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # The next update waits for `due` steps. A pass steps every environment, updates, or does both (default).
+            # The next update waits for `due` steps. A turn of this loop steps all environments, updates, or does both.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.act(envs.observations))

@@ -8,10 +8,11 @@
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
 The actor π samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
-earns much, yet stays as random as it can, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until
-the entropy has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'). Actor
-and critics use the smaller of the two estimates of Q, because an actor that maximizes one estimate exploits its errors.
-In the paper slow copies of the critics, the target critics, compute y. By default batch normalization replaces them.
+earns much but stays random, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until the entropy
+has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as
+in dqn_cartpole.py. Actor and critics use the smaller of the two estimates of Q, because an actor that maximizes one
+estimate exploits its errors. In the paper slow copies of the critics, the target critics, compute y. By default batch
+normalization replaces them.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -52,7 +53,7 @@ class Config:
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
-    adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ (theirs: 0.9): Adam's β1
+    adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ, there not for α (theirs: 0.9): Adam's β1
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
@@ -137,9 +138,9 @@ class Actor(nn.Module):
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
         u = mean + log_std.exp() * noise
-        log_normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # log N(u)
+        log_density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # log N(u): noise = (u − mean) / σ
         log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
-        return u.tanh(), (log_normal - log_determinant).sum(-1)
+        return u.tanh(), (log_density - log_determinant).sum(-1)
 
 
 class TwinCritics(nn.Module):
@@ -205,7 +206,7 @@ class ReplayBuffer:
         self.size = self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). When full, over the oldest."""
+        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full one drops its oldest."""
         actions = actions.reshape(len(actions), -1)
         columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
         rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
@@ -329,8 +330,8 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # Ours: one pass, as in CrossQ. Batch norm takes one mean and variance over (s, a) and (s', a'). No gradient
-            # reaches next_q, because y is computed under no_grad.
+            # Ours: one pass, as in CrossQ. Batch norm takes one mean and variance over (s, a) and (s', a'), because the
+            # new a' are distributed differently. No gradient reaches next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
@@ -394,7 +395,7 @@ def cuda_graph(agent):
             with torch.cuda.graph(graph):
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
-                group["capturable"] = False
+                group["capturable"] = False  # it is saved with the optimizer, and a warning without a graph
         for old, new in zip(recorded, batch):
             old.copy_(new)
         graph.replay()
@@ -470,7 +471,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # The next update waits for `due` steps. A pass steps every environment, updates, or does both (default).
+            # The next update waits for `due` steps. A turn of this loop steps all environments, updates, or does both.
             # The physics runs beside the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
