@@ -122,7 +122,7 @@ def read_command_line(config_class, description):
     sources = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--resume", "--evaluate"):
         sources.add_argument(flag, type=Path, nargs="?")
-    sources.add_argument("--tutorial", action="store_true")
+    sources.add_argument("--tutorial", action=argparse.BooleanOptionalAction)
     given = {name: value for name, value in vars(sources.parse_known_args()[0]).items() if value}
     if given.keys() >= {"resume", "evaluate"}:
         raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
@@ -232,9 +232,11 @@ def find_task(config, action_space):
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
             observations, actions = env.observation_space, env.action_space
-            limit = env.spec.max_episode_steps or 10_000  # or an evaluation might never end
             # Not env.spec: it has wrappers of the task's own too, which gymnasium cannot always compare with new ones.
-            task = dataclasses.replace(gym.registry[env.spec.id], max_episode_steps=limit)
+            # Where a task makes another one within itself, it may be that one's. And it is None if it cannot be copied.
+            task = gym.registry[env.unwrapped.spec.id]
+            limit = config.max_episode_steps or (env.spec or task).max_episode_steps
+            task = dataclasses.replace(task, max_episode_steps=limit or 10_000)  # or an evaluation might never end
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     finally:
@@ -256,14 +258,27 @@ def find_task(config, action_space):
 
 
 @contextlib.contextmanager
-def telling_task_errors():
+def telling_task_errors(who="the task"):
     """Turns an exception of the task into a `TaskError`, which, unlike others, always comes through a pipe whole."""
     try:
         yield
     except RunError:
         raise
     except (Exception, SystemExit) as error:
-        raise TaskError(f"the task failed: {first_line(error)}\n{traceback.format_exc()}") from None
+        raise TaskError(f"{who} failed: {first_line(error)}\n{traceback.format_exc()}") from None
+
+
+def signal_handler(act):
+    """A handler that calls `act(number)` in this process. What a task forks from it ignores Ctrl-C and can be ended."""
+    owner = os.getpid()
+
+    def handler(number, _):
+        if os.getpid() == owner:
+            act(number)
+        elif number != signal.SIGINT:
+            os._exit(128 + number)
+
+    return handler
 
 
 def start_worker(task=None):
@@ -277,7 +292,7 @@ def start_worker(task=None):
     torch.seed()
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else lambda *_: None)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal_handler(lambda _: None))
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
@@ -353,7 +368,11 @@ class Environments:
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
+        here = not in_workers and threading.current_thread() is threading.main_thread()
+        handler = here and signal.signal(signal.SIGINT, signal.SIG_IGN)  # what the task starts ignores Ctrl-C
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
+        if here:
+            signal.signal(signal.SIGINT, handler)
         run.stack.callback(self.close)
         (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
@@ -453,8 +472,22 @@ def export_policy(path, policy, observation_shape):
 
 
 def _in_worker(function, file, *arguments):
-    with telling_task_errors():
+    with telling_task_errors("the task or the policy"):
         return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
+
+
+def say(line):
+    """Prints a line, above the progress bar. A program whose output nobody reads any more goes on."""
+    try:
+        if sys.stdout is not None:
+            tqdm.write(line)
+            sys.stdout.flush()
+    except ValueError:
+        pass  # the stream is closed
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would complain at its end
 
 
 class Run:
@@ -518,7 +551,8 @@ class Run:
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
                     if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-                        self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
+                        handler = signal_handler(self._request_stop)
+                        self.stack.callback(signal.signal, number, signal.signal(number, handler))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
                 size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
@@ -555,7 +589,7 @@ class Run:
         program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
-    def _request_stop(self, number, _):
+    def _request_stop(self, number):
         if self.stopping and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stopping = True
@@ -633,17 +667,8 @@ class Run:
             self._save("best_policy.pt", "policy", {"weights": weights})
 
     def print(self, line):
-        """Prints a line, above the progress bar. A run whose output nobody reads any more goes on."""
-        try:
-            if self.writes and sys.stdout is not None:
-                tqdm.write(line)
-                sys.stdout.flush()
-        except ValueError:
-            pass  # the stream is closed
-        except OSError as error:
-            if error.errno == errno.ENOSPC:
-                raise
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would complain at its end
+        if self.writes:
+            say(line)
 
     def _log(self, table, step, env_steps, values):
         seconds = round(time.perf_counter() - self.started, 3)
@@ -651,17 +676,17 @@ class Run:
         self._write_rows(table, self.tables[table][-1:])
 
     def _write_rows(self, table, new):
-        """Shows TensorBoard the `new` rows of a table and writes its file, which has all."""
-        for row in new:
-            for name, value in row.items():
-                if name != "step" and math.isfinite(value):
-                    self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
+        """Writes a table's file, which has all rows, and shows TensorBoard the `new` ones."""
         if new:
             writer = csv.DictWriter(text := self.texts[table], self.tables[table][0], lineterminator="\n")
             if not text.tell():
                 writer.writeheader()
             writer.writerows(new)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+        for row in new:  # after the file: the run may go on in another process, which writes its own events
+            for name, value in row.items():
+                if name != "step" and math.isfinite(value):
+                    self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
 
     def log_training(self, step, env_steps, environments, metrics):
         """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
@@ -825,13 +850,13 @@ def evaluate_policy(config, script, policy, task, evaluate):
     seeds, video = evaluation_seeds(config), config.evaluate.with_suffix(".mp4").absolute()
     _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
     try:
-        print(f"{config.evaluate}: {text}", flush=True)
-    except OSError as error:  # a full disk, or a reader that is gone
+        say(f"{config.evaluate}: {text}")
+        if config.video:
+            with or_warn("video", say):
+                film([(policy, None, None)], task, seeds[0], video)
+                say(f"filmed one episode: {video}")
+    except OSError as error:  # a full disk
         raise RunError(first_line(error)) from None
-    if config.video:
-        with or_warn("video", print):
-            film([(policy, None, None)], task, seeds[0], video)
-            print(f"filmed one episode: {video}")
 
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):

@@ -101,17 +101,17 @@ class ObservationScaling(nn.Module):
 
     def __init__(self, space):
         super().__init__()
-        low, high = (torch.as_tensor(bound, dtype=torch.float32).flatten() for bound in (space.low, space.high))
+        low, high = (torch.from_numpy(np.float32(bound)).flatten() for bound in (space.low, space.high))
         half_range = (high - low) / 2
         bounded = half_range.isfinite() & (half_range > 0)
         self.register_buffer("center", torch.where(bounded, low + half_range, 0.0))
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds so wide that the observations (N, O) would be scaled to below 1/200: none of CartPole's."""
-        largest = (observations - self.center).abs().amax(0)
+        """Drops bounds 200 times as wide as the observations (N, O), which would hide them: none of CartPole's."""
+        largest = observations.abs().amax(0)
         ranks.average([largest])  # in place, over the processes
-        beyond = self.half_range > 200 * largest
+        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # a pixel may still be black
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):

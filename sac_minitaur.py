@@ -165,8 +165,8 @@ class Policy(nn.Module):
         self.action_space = action_space
         sizes = math.prod(observation_space.shape), math.prod(action_space.shape)
         self.actor = Actor(*sizes, config.actor_layers)
-        self.register_buffer("low", torch.as_tensor(action_space.low, dtype=torch.float32))
-        self.register_buffer("high", torch.as_tensor(action_space.high, dtype=torch.float32))
+        self.register_buffer("low", torch.tensor(action_space.low, dtype=torch.float32))  # a copy, to load into
+        self.register_buffer("high", torch.tensor(action_space.high, dtype=torch.float32))
 
     def forward(self, observation):
         """Actions (batch, *action shape) for observations (batch, *observation shape)."""

@@ -52,10 +52,13 @@ def test_scaling_maps_bounds_to_one():
     observations = torch.tensor([[2.0, -4, 3, 3, 3, 5], [6, 4, -7, -7, -7, 5], [4, 1, 0, 0, 0, 5]])
     scaled = [[-1.0, -1, 3, 3, 3, 5], [1, 1, -7, -7, -7, 5], [0, 0.25, 0, 0, 0, 5]]
     assert scaling(observations).tolist() == scaled
-    # Bounds that nobody reaches are none, those within two hundred times of the data are.
-    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(np.float32([-62, -20]), np.float32([62, 20])))
-    scaling.fit(torch.tensor([[0.3, 0.1], [-0.1, -0.2]]), common.Ranks())
-    assert scaling(torch.tensor([2.0, 10.0])).tolist() == [2.0, 0.5]
+    # Bounds that nobody reaches are none, on one side too. Those within two hundred times of the data, or of 1, are.
+    low, high = np.float32([-62, -20, 0, 0, -1e6]), np.float32([62, 20, 1e4, 255, 1e6])
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(low, high))
+    scaling.fit(torch.tensor([[0.3, 0.1, 5, 0, 0], [-0.1, -0.2, 0, 0, 0]]), common.Ranks())
+    assert scaling(torch.tensor([2.0, 10, 5, 255, 3])).tolist() == [2.0, 0.5, 5, 1, 3]
+    for dtype in (np.uint8, np.longdouble, ">f4"):
+        assert dqn_cartpole.ObservationScaling(gym.spaces.Box(0, 1, (2,), dtype)).center.tolist() == [0.5, 0.5]
     unscaled = make_agent(observation_scaling=False)
     assert torch.equal(unscaled.scaling(observations), observations)
 
@@ -263,6 +266,8 @@ def test_tutorial_sets_every_choice_of_ours_back(monkeypatch):
     assert Config(tutorial=True).gamma == 1.0
     with pytest.raises(ValueError, match="tutorial"):
         Config(tutorial="no")
+    monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--no-tutorial"])
+    assert common.read_command_line(Config, "") == Config()
     monkeypatch.setattr(sys, "argv", ["dqn_cartpole.py", "--tutorial", "--gamma", "1"])
     assert common.read_command_line(Config, "") == Config(tutorial=True)
 

@@ -1,5 +1,6 @@
 """Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ import torch
 
 import common
 import sac_minitaur
-from runs import checkpoint, load_policy, read_csv
+from runs import Process, checkpoint, flags, load_policy, read_csv, wait_until
 from sac_minitaur import Config, Policy
 from test_sac import TINY, main, train
 
@@ -80,6 +81,25 @@ class Starts(Echo):
         self.program.wait()
 
 
+class Helped(gym.Wrapper):
+    """CartPole with a program and a forked process, which run until it ends them."""
+
+    def __init__(self, **options):
+        super().__init__(gym.make("CartPole-v1", **options))
+        self.program = subprocess.Popen(["sleep", "600"])
+        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
+        self.process.start()
+
+    def step(self, action):
+        assert self.program.poll() is None and self.process.is_alive()
+        return self.env.step(action)
+
+    def close(self):
+        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
+            each.terminate()
+            wait()
+
+
 class Moves(gym.Wrapper):
     """Goes to a directory of its own, where its files lie, at its start or at a step."""
 
@@ -107,6 +127,7 @@ class TwoArguments(Exception):
 
 gym.register("Echo-v0", entry_point=Echo, max_episode_steps=4)
 gym.register("Endless-v0", entry_point=Echo)
+gym.register("Helped-v0", entry_point=Helped)
 gym.register("Unrepeatable-v0", entry_point=Unrepeatable, max_episode_steps=100)
 IDS = {"env_id": f"{__name__}:Echo-v0"}
 
@@ -174,6 +195,9 @@ def test_actions_never_leave_the_bounds(dtype, scale):
             received.append(action)
             return np.zeros(1, np.float32), 0.0, False, False, {}
 
+    policy.load_state_dict(policy.state_dict() | {"low": torch.full((300,), -1e9)})  # the task's own bounds stay
+    assert np.array_equal(space.low, low)
+    policy.load_state_dict(policy.state_dict() | {"low": torch.from_numpy(low.astype(np.float32))})
     env = sac_minitaur.make_training_env(gym.envs.registration.EnvSpec("Task-v0", Task), False)
     env.reset()
     for sign in (-1, 1, 0.999, -1e-3):
@@ -305,6 +329,34 @@ def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeyp
     with pytest.raises(common.TaskError, match="no server"):
         train(tmp_path / "run", **SHORT, **IDS)
     assert not (tmp_path / "waited for").exists()
+
+
+def test_ctrl_c_stops_the_run_and_nothing_that_its_task_has_started(tmp_path):
+    """A terminal sends it to all of them. What the task starts is there until the task ends it."""
+    arguments = flags("dqn_cartpole", tmp_path / "run", "--env-id", f"{__name__}:Helped-v0", "--num-iterations", 10**6)
+    run = Process("dqn_cartpole", [*arguments, "--eval-interval", 10**6], tmp_path / "output")
+    wait_until((tmp_path / "run" / "train.csv").exists, 60)
+    os.killpg(run.pid, signal.SIGINT)
+    assert run.wait() == 0 and "stopped at step" in run.stdout, run.stderr
+    assert run.stderr.count("stopping") == 1
+
+
+def test_a_task_that_is_made_of_another(register, tmp_path):
+    """Once it has asked for the other one's spec, gymnasium takes that for its own."""
+
+    def make():
+        env = gym.make(IDS["env_id"])
+        return gym.wrappers.TransformReward(env, lambda reward: reward + 100 * env.spec.max_episode_steps)
+
+    path, _ = train(tmp_path / "run", **SHORT, env_id=register(make, limit=3))
+    _, _, rewards, _, _ = checkpoint(path)["ranks"][0]["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
+    assert rewards.unique().tolist() == [401, 402, 403]
+
+
+def test_a_task_that_cannot_be_copied(register, tmp_path):
+    """gymnasium then tells no spec. The time limit is the registered one."""
+    path, _ = train(tmp_path / "run", **SHORT, env_id=register(partial(lambda lock: Echo(), threading.Lock()), limit=3))
+    assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 3
 
 
 def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(register, monkeypatch, tmp_path):
