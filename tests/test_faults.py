@@ -331,15 +331,16 @@ def print_to_a_full_disk(module):
     os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
 
 
+def have_no_reader(module):
+    """As before `| true`."""
+    reader, writer = os.pipe()
+    os.dup2(writer, 1)
+    os.close(reader)
+
+
 def lose_the_reader(module):
-    """As after `| head`, in the midst of it."""
-
-    def lose_it():
-        reader, writer = os.pipe()
-        os.dup2(writer, 1)
-        os.close(reader)
-
-    before_update(module, 50, lose_it)
+    """As before `| head`, in the midst of it."""
+    before_update(module, 50, partial(have_no_reader, module))
 
 
 def close_stdout(module):
@@ -381,7 +382,7 @@ def test_trains_on_when_its_program_closes_the_stream(tmp_path):
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
 
 
-@pytest.mark.parametrize("hook", [replace_stderr, have_no_streams])
+@pytest.mark.parametrize("hook", [have_no_reader, replace_stderr, have_no_streams])
 def test_evaluates_without_a_console(script, copy, tmp_path, hook):
     assert not finish(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", hook).stderr
     assert (copy / "policy.mp4").exists()
