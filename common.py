@@ -268,13 +268,13 @@ def telling_task_errors(who="the task"):
         raise TaskError(f"{who} failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
-def signal_handler(act):
-    """A handler that calls `act(number)` in this process. What a task forks from it ignores Ctrl-C and can be ended."""
+def in_this_process(act):
+    """A signal handler that calls `act` in this process. What a task forks from it ignores Ctrl-C and can be ended."""
     owner = os.getpid()
 
-    def handler(number, _):
+    def handler(number, frame):
         if os.getpid() == owner:
-            act(number)
+            act(number, frame)
         elif number != signal.SIGINT:
             os._exit(128 + number)
 
@@ -292,7 +292,7 @@ def start_worker(task=None):
     torch.seed()
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal_handler(lambda _: None))
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else in_this_process(lambda *_: None))
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
@@ -472,8 +472,20 @@ def export_policy(path, policy, observation_shape):
 
 
 def _in_worker(function, file, *arguments):
-    with telling_task_errors("the task or the policy"):
-        return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
+    ignored = signal.signal(signal.SIGTERM, in_this_process(signal.default_int_handler))  # see `_end_worker`
+    try:
+        with telling_task_errors("the task or the policy"):
+            return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
+    except KeyboardInterrupt:
+        os._exit(1)
+    finally:
+        signal.signal(signal.SIGTERM, ignored)
+
+
+def _end_worker(worker):
+    worker.terminate()  # in an episode KeyboardInterrupt: its task may have to end what it has started
+    worker.join(5)
+    worker.kill()
 
 
 def say(line):
@@ -507,6 +519,7 @@ class Run:
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
         self.ranks, self.checkpoint = Ranks(), {}
         self.writes = self.ranks.rank == 0
+        self.print = say if self.writes else str  # the others are silent
         self.device = select_device(config.device, self.ranks.local_rank)
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
@@ -551,7 +564,7 @@ class Run:
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
                     if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-                        handler = signal_handler(self._request_stop)
+                        handler = in_this_process(self._request_stop)
                         self.stack.callback(signal.signal, number, signal.signal(number, handler))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -562,7 +575,8 @@ class Run:
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
                 list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
                 for worker in set(multiprocessing.active_children()).difference(others):
-                    self.stack.callback(worker.kill)
+                    self.stack.callback(_end_worker, worker)
+                self.stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)  # ends those that are idle
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(self.config.num_threads)
@@ -589,7 +603,7 @@ class Run:
         program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
-    def _request_stop(self, number):
+    def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.stopping = True
@@ -665,10 +679,6 @@ class Run:
             self._write_rows(table, rows)
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
             self._save("best_policy.pt", "policy", {"weights": weights})
-
-    def print(self, line):
-        if self.writes:
-            say(line)
 
     def _log(self, table, step, env_steps, values):
         seconds = round(time.perf_counter() - self.started, 3)
