@@ -472,20 +472,8 @@ def export_policy(path, policy, observation_shape):
 
 
 def _in_worker(function, file, *arguments):
-    ignored = signal.signal(signal.SIGTERM, in_this_process(signal.default_int_handler))  # see `_end_worker`
-    try:
-        with telling_task_errors("the task or the policy"):
-            return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
-    except KeyboardInterrupt:
-        os._exit(1)
-    finally:
-        signal.signal(signal.SIGTERM, ignored)
-
-
-def _end_worker(worker):
-    worker.terminate()  # in an episode KeyboardInterrupt: its task may have to end what it has started
-    worker.join(5)
-    worker.kill()
+    with telling_task_errors("the task or the policy"):
+        return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
 
 
 def say(line):
@@ -575,8 +563,7 @@ class Run:
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
                 list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
                 for worker in set(multiprocessing.active_children()).difference(others):
-                    self.stack.callback(_end_worker, worker)
-                self.stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)  # ends those that are idle
+                    self.stack.callback(worker.kill)
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(self.config.num_threads)
