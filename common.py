@@ -507,7 +507,7 @@ class Run:
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
         self.ranks, self.checkpoint = Ranks(), {}
         self.writes = self.ranks.rank == 0
-        self.print = say if self.writes else str  # the others are silent
+        self.print = say if self.writes else lambda line: None
         self.device = select_device(config.device, self.ranks.local_rank)
         if self.ranks.world_size > 1 and ":" in config.device:
             raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")

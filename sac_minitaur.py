@@ -395,7 +395,7 @@ def cuda_graph(agent):
             with torch.cuda.graph(graph):
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
-                group["capturable"] = False  # it is saved with the optimizer, and a warning without a graph
+                group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
         for old, new in zip(recorded, batch):
             old.copy_(new)
         graph.replay()
