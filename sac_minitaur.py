@@ -417,28 +417,20 @@ def evaluate(policy, task, seed):
     return episode_return, length
 
 
-class AppendPrivileged(gym.ObservationWrapper):
-    """Appends `privileged_observation()` (S − O,), for the critics, to every observation (O,)."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        own, more = env.observation_space, env.unwrapped.privileged_space
-        self.observation_space = gym.spaces.Box(np.append(own.low, more.low), np.append(own.high, more.high))
-
-    def observation(self, observation):
-        return np.append(observation, self.unwrapped.privileged_observation())
-
-
 def make_training_env(task, privileged):
     """The task with actions in [-1, 1], as the agent sees it in training.
 
-    With `privileged` the observations end with what only the critics see, where the environment has that.
+    With `privileged` the observations (O,) end with what only the critics see, (S − O,), where the environment has it.
     """
     env = gym.make(task)
     low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
     unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
     env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
-    return AppendPrivileged(env) if privileged and hasattr(env.unwrapped, "privileged_space") else env
+    if privileged and hasattr(env.unwrapped, "privileged_space"):
+        own, more, observe = env.observation_space, env.unwrapped.privileged_space, env.unwrapped.privileged_observation
+        both = gym.spaces.Box(np.append(own.low, more.low), np.append(own.high, more.high))
+        env = gym.wrappers.TransformObservation(env, lambda observation: np.append(observation, observe()), both)
+    return env
 
 
 def train(config):
