@@ -268,17 +268,12 @@ def telling_task_errors(who="the task"):
         raise TaskError(f"{who} failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
-def in_this_process(act):
-    """A signal handler that calls `act` in this process. What a task forks from it ignores Ctrl-C and can be ended."""
-    owner = os.getpid()
-
-    def handler(number, frame):
-        if os.getpid() == owner:
-            act(number, frame)
-        elif number != signal.SIGINT:
-            os._exit(128 + number)
-
-    return handler
+def handle_in(process, act, number, frame):
+    """Handles a signal by `act` in this process only. What a task forks from it ignores Ctrl-C and can be ended."""
+    if os.getpid() == process:
+        act(number, frame)
+    elif number != signal.SIGINT:
+        os._exit(128 + number)
 
 
 def start_worker(task=None):
@@ -292,7 +287,8 @@ def start_worker(task=None):
     torch.seed()
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else in_this_process(lambda *_: None))
+        ignore = partial(handle_in, os.getpid(), lambda *_: None)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else ignore)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
@@ -552,7 +548,7 @@ class Run:
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
                     if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-                        handler = in_this_process(self._request_stop)
+                        handler = partial(handle_in, os.getpid(), self._request_stop)
                         self.stack.callback(signal.signal, number, signal.signal(number, handler))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
