@@ -136,9 +136,11 @@ def main():
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif "pendulum" in name:
             print_table(name, goal=-200, late=5_000)
-        elif name in ("sac_hopper", "sac_halfcheetah"):
+        elif "_without_" in name:
+            continue
+        elif name.startswith(("sac_hopper", "sac_halfcheetah")):
             print_table(name, goal=3_000, late=50_000)
-        elif name.startswith("sac") and "_without_" not in name:
+        elif name.startswith("sac"):
             print_table(name, goal=15, late=50_000)
     print_sac_ablation("sac_minitaur", "sac_50000_without_", (10_000, 20_000, 30_000, 50_000))
     print_dqn_ablation("dqn_cartpole")
