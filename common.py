@@ -363,7 +363,9 @@ class Environments:
         # It would show a task's error once more for each process.
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
-        kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD) if in_workers else gym.vector.SyncVectorEnv
+        kind = gym.vector.SyncVectorEnv
+        if in_workers:  # no daemons, which could not start processes of their own
+            kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
         here = not in_workers and threading.current_thread() is threading.main_thread()
         handler = here and signal.signal(signal.SIGINT, signal.SIG_IGN)  # what the task starts ignores Ctrl-C
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
@@ -631,8 +633,7 @@ class Run:
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         step, env_steps = self.saved_step, saved.get("env_steps", 0)
-        if not env_steps:  # a kill in the first steps can be resumed too
-            self.save(step, env_steps, agent, buffer, environments)
+        self.save(step, env_steps, agent, buffer, environments)  # a kill from here on loses no raised --num-iterations
         self.evaluate(0, 0, policy=None)  # random actions, for comparison
         self.last_logged = time.perf_counter(), step
         return step, env_steps
@@ -665,16 +666,21 @@ class Run:
 
     def _log(self, table, step, env_steps, values):
         seconds = round(time.perf_counter() - self.started, 3)
+        values = {name: float(value) for name, value in values.items()}  # a checkpoint may not hold numpy's numbers
         self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
         self._write_rows(table, self.tables[table][-1:])
 
     def _write_rows(self, table, new):
         """Writes a table's file, which has all rows, and shows TensorBoard the `new` ones."""
+        rows, text = self.tables[table], self.texts[table]
         if new:
-            writer = csv.DictWriter(text := self.texts[table], self.tables[table][0], lineterminator="\n")
-            if not text.tell():
+            if added := [name for name in new[-1] if name not in rows[0]]:  # a fork's new metric
+                rows[0] |= dict.fromkeys(added, math.nan)
+                text.truncate(text.seek(0))
+            writer, begun = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n"), text.tell()
+            if not begun:
                 writer.writeheader()
-            writer.writerows(new)
+            writer.writerows(new if begun else rows)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after the file: the run may go on in another process, which writes its own events
             for name, value in row.items():

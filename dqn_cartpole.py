@@ -166,7 +166,7 @@ class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
     One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
-    the episode could go on, so its last state has a value: only `terminated` marks an end.
+    the episode could go on, so its last state has a value: only `terminated` marks an end. A checkpoint has the rows.
     """
 
     def __init__(self, capacity, observation_size, device):

@@ -197,7 +197,7 @@ class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
     One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
-    the episode could go on, so its last state has a value: only `terminated` marks an end.
+    the episode could go on, so its last state has a value: only `terminated` marks an end. A checkpoint has the rows.
     """
 
     def __init__(self, capacity, state_size, action_size, device):
@@ -376,8 +376,8 @@ def cuda_graph(agent):
     """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, and every later call replays that.
 
     The numbers stay the same. Without it, the GPU waits for Python between hundreds of small operations. But a replay
-    runs no Python code: what Python computes or decides in `update` stays as it was recorded. Raises InputError where
-    there is no GPU, or more than one process.
+    runs no Python code: what Python reads, computes or decides in `update` stays as it was recorded. Raises InputError
+    where there is no GPU, or more than one process.
     """
     if agent.device.type != "cuda" or agent.ranks.world_size > 1:
         raise common.InputError("--cuda-graph is for one process with a CUDA GPU: use --no-cuda-graph")

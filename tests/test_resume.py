@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 import imageio
+import numpy as np
 import pytest
 import torch
 
@@ -63,8 +64,15 @@ def writing_a_checkpoint(module):
 
 
 def between_policy_and_checkpoint(module):
-    save = common.Run._save
-    common.Run._save = lambda run, name, *more: die() if name == "checkpoint.pt" else save(run, name, *more)
+    save, names = common.Run._save, []
+
+    def save_or_die(run, name, *more):
+        names.append(name)
+        if names.count("checkpoint.pt") == 2:  # the first is as the run starts
+            die()
+        save(run, name, *more)
+
+    common.Run._save = save_or_die
 
 
 def filming(module):
@@ -143,8 +151,8 @@ def test_raised_run_equals_a_longer_one(script, reference, tmp_path):
     raised = ["--resume", tmp_path / "run", "--num-iterations", 300]
     hook = partial(before_update, count=5, action=die)
     assert Process(script, raised, tmp_path / "raised", hook).wait() == -signal.SIGKILL
-    # The real command, in a new interpreter.
-    command = [sys.executable, ROOT / f"{script}.py", "--resume", tmp_path / "run", "--num-iterations", "300"]
+    # The real command, in a new interpreter. The run knows that it was raised.
+    command = [sys.executable, ROOT / f"{script}.py", "--resume", tmp_path / "run"]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert_same_run(tmp_path / "run", reference)
@@ -164,6 +172,26 @@ def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
     finish(script, ["--resume", tmp_path / "run", "--device", "cpu", "--num-threads", 2], tmp_path / "output")
     saved = common.read_file(tmp_path / "run" / "best_policy.pt", "policy", script)
     assert_same(saved["weights"], state["best"][1])
+
+
+def test_metrics_of_a_fork(script, reference, tmp_path, monkeypatch):
+    """A new one becomes a column. An evaluation may return numpy's numbers, which a checkpoint may not hold."""
+    shutil.copytree(reference, run := tmp_path / "run")
+    module = importlib.import_module(script)
+    agent = getattr(module, AGENTS[script])
+    update, (columns, *before) = agent.update, rows(run / "train.csv")
+    monkeypatch.setattr(agent, "update", lambda *batch: update(*batch) | {"one": torch.tensor(1.0)})
+    monkeypatch.setattr(module, "evaluate", evaluate_in_numpy)
+    for steps in (320, 340):
+        module.train(module.Config(resume=run, num_iterations=steps))
+        table = rows(run / "train.csv")
+        assert table[:16] == [[*columns, "one"], *([*row, "nan"] for row in before)]
+        assert [(row[0], row[-1]) for row in table[16:]] == [(str(i), "1.0") for i in range(320, steps + 1, 20)]
+    assert_tensorboard_once(run)
+
+
+def evaluate_in_numpy(policy, task, seed):
+    return np.float64(seed), np.int64(1)
 
 
 def stop_and_continue(script, run_dir, output, arguments, hook):
@@ -293,12 +321,16 @@ def test_every_other_change_is_refused(script, reference, monkeypatch):
     others = {"device": "auto", "tutorial": True, "max_episode_steps": 77, "run_dir": Path("x"), "env_id": "x"}
     for field in set(vars(config)) - {"resume", "evaluate"}:
         value = getattr(config, field)
-        if isinstance(value, tuple):
+        if field in others:
+            changed = others[field]
+        elif isinstance(value, tuple):
             changed = (*value, 8)
         elif isinstance(value, bool):
             changed = not value
+        elif isinstance(value, (int, float)):
+            changed = value + 1 if isinstance(value, int) else value / 2 or 0.5
         else:
-            changed = others[field] if field in others else value + 1 if isinstance(value, int) else value / 2 or 0.5
+            continue  # a fork's own, of another type
         continued = dataclasses.replace(config, **{field: changed})
         if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads", "cuda_graph"):
             common.Run(continued, script, None, None)
@@ -349,7 +381,7 @@ def test_minitaur_resumes_exactly(tmp_path):
     assert run.wait() == -signal.SIGKILL
     state = checkpoint(tmp_path / "run")
     assert state["step"] == 40 and len(state["ranks"][0]["environments"]["episodes"][0][1]) > 0  # in mid-episode
-    assert state["agent"]["critics.q1.1.weight"].shape[1] == 28 + 7 + 8  # what only they see among it
+    assert state["ranks"][0]["buffer"]["rows"].shape[1] > 2 * 28 + 8 + 2  # with what only the critics see
     finish("sac_minitaur", ["--resume", tmp_path / "run"], tmp_path / "3")
     assert_same_run(tmp_path / "run", tmp_path / "whole")
 

@@ -68,17 +68,21 @@ class Unrepeatable(Echo):
 
 
 class Starts(Echo):
-    """Starts a program, as a simulator that is a server, and ends it. `pids` is a file."""
+    """Starts a program, as a simulator that is a server, and forks a process. It ends both. `pids` is a file."""
 
     def __init__(self, pids):
         super().__init__()
         self.program = subprocess.Popen(["sleep", "600"])
+        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
+        self.process.start()
         with open(pids, "a") as file:
-            file.write(f"{self.program.pid} ")
+            file.write(f"{self.program.pid} {self.process.pid} ")
 
     def close(self):
         self.program.terminate()
         self.program.wait()
+        self.process.terminate()
+        self.process.join()
 
 
 class Helped(gym.Wrapper):
