@@ -603,7 +603,7 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint or saves a first one, begins the files, and evaluates the random policy.
+        """Restores the checkpoint, begins the files, saves a new checkpoint, and evaluates the random policy.
 
         Returns the gradient updates and the environment steps done so far. Nothing was written before: here all that
         the user gave has been found usable.
