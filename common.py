@@ -285,9 +285,9 @@ def start_worker(task=None):
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: forked, all workers would draw the same
     torch.seed()
+    ignore = partial(handle_in, os.getpid(), lambda *_: None)
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
-        ignore = partial(handle_in, os.getpid(), lambda *_: None)
         signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else ignore)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
@@ -603,7 +603,7 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint, begins the files, saves a new checkpoint, and evaluates the random policy.
+        """Restores the checkpoint, begins the files, saves one for a new config, and evaluates the random policy.
 
         Returns the gradient updates and the environment steps done so far. Nothing was written before: here all that
         the user gave has been found usable.
@@ -633,7 +633,8 @@ class Run:
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         step, env_steps = self.saved_step, saved.get("env_steps", 0)
-        self.save(step, env_steps, agent, buffer, environments)  # a kill from here on loses no raised --num-iterations
+        if plain_config(config) != saved.get("config"):  # a kill must lose no first steps, and no raised flag
+            self.save(step, env_steps, agent, buffer, environments)
         self.evaluate(0, 0, policy=None)  # random actions, for comparison
         self.last_logged = time.perf_counter(), step
         return step, env_steps
@@ -666,7 +667,6 @@ class Run:
 
     def _log(self, table, step, env_steps, values):
         seconds = round(time.perf_counter() - self.started, 3)
-        values = {name: float(value) for name, value in values.items()}  # a checkpoint may not hold numpy's numbers
         self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
         self._write_rows(table, self.tables[table][-1:])
 
@@ -677,10 +677,12 @@ class Run:
             if added := [name for name in new[-1] if name not in rows[0]]:  # a fork's new metric
                 rows[0] |= dict.fromkeys(added, math.nan)
                 text.truncate(text.seek(0))
-            writer, begun = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n"), text.tell()
-            if not begun:
+            writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
+            if text.tell():
+                writer.writerows(new)
+            else:
                 writer.writeheader()
-            writer.writerows(new if begun else rows)
+                writer.writerows(rows)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after the file: the run may go on in another process, which writes its own events
             for name, value in row.items():
@@ -831,7 +833,7 @@ def require_finite(module, step):
 
 def summarize(results):
     """The metrics of evaluation episodes, from a list of (return, length), and a line that tells them."""
-    returns, lengths = zip(*results)
+    returns, lengths = np.array(results, np.float64).T.tolist()  # a checkpoint may not hold numpy's own numbers
     mean, spread, length, length_spread = (float(f(x)) for x in (returns, lengths) for f in (np.mean, np.std))
     row = {"average_return": mean, "std_return": spread, "min_return": min(returns), "max_return": max(returns)}
     row |= {"average_episode_length": length, "std_episode_length": length_spread}

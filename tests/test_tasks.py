@@ -67,42 +67,47 @@ class Unrepeatable(Echo):
         return observation + self.error_of_observations, reward + self.error_of_rewards, done, False, {}
 
 
+class Helpers:
+    """A program, as a simulator that is a server, and a forked process. Both run until the task ends them."""
+
+    def __init__(self):
+        self.program = subprocess.Popen(["sleep", "600"])
+        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
+        self.process.start()
+
+    def end(self):
+        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
+            each.terminate()
+            wait()
+
+
 class Starts(Echo):
-    """Starts a program, as a simulator that is a server, and forks a process. It ends both. `pids` is a file."""
+    """Starts helpers and ends them. `pids` is a file."""
 
     def __init__(self, pids):
         super().__init__()
-        self.program = subprocess.Popen(["sleep", "600"])
-        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
-        self.process.start()
+        self.helpers = Helpers()
         with open(pids, "a") as file:
-            file.write(f"{self.program.pid} {self.process.pid} ")
+            file.write(f"{self.helpers.program.pid} {self.helpers.process.pid} ")
 
     def close(self):
-        self.program.terminate()
-        self.program.wait()
-        self.process.terminate()
-        self.process.join()
+        self.helpers.end()
 
 
 class Helped(gym.Wrapper):
-    """CartPole with a program and a forked process, which run until it ends them."""
+    """CartPole that needs its helpers."""
 
     def __init__(self, **options):
         super().__init__(gym.make("CartPole-v1", **options))
-        self.program = subprocess.Popen(["sleep", "600"])
-        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
-        self.process.start()
+        self.helpers = Helpers()
 
     def step(self, action):
-        assert self.program.poll() is None and self.process.is_alive()
+        assert self.helpers.program.poll() is None and self.helpers.process.is_alive()
         observation, *_ = self.env.step(action)
         return observation, 1.0, False, False, {}  # its time limit alone ends an episode
 
     def close(self):
-        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
-            each.terminate()
-            wait()
+        self.helpers.end()
 
 
 class Moves(gym.Wrapper):
@@ -275,7 +280,7 @@ def test_the_program_that_a_task_starts_is_ended_with_it(in_workers, register, m
     monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=in_workers))
     train(tmp_path / "run", **SHORT, env_id=register(Starts, pids=tmp_path / "pids"), num_envs=2)
     pids = (tmp_path / "pids").read_text().split()
-    assert len(pids) >= 7 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+    assert len(pids) >= 14 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
