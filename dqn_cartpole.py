@@ -57,7 +57,7 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): Q starts near mean r / (1 − γ), r of the first steps: `fit_scaling`
+    value_unit: bool = True  # ours (theirs: no): Q starts near the first steps' mean reward / (1 − γ): `fit_scaling`
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -108,10 +108,10 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds 200 times as wide as the observations (N, O), which would hide them: none of CartPole's."""
+        """Drops bounds 200 times as wide as the observations (N, O), which would become nearly 0. CartPole has none."""
         largest = observations.abs().amax(0)
         ranks.average([largest])  # in place, over the processes
-        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # a pixel may still be black
+        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # 1 where all were 0: black pixels
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):
@@ -130,7 +130,7 @@ class QNetwork(nn.Module):
         layers, inputs = [], observation_size
         for units in hidden_layers:
             layers += [linear := nn.Linear(inputs, units), nn.ReLU(inplace=True)]
-            std = math.sqrt(2 / inputs) / 0.87962566103423978  # as in Keras: the std of a standard normal cut at ±2
+            std = math.sqrt(2 / inputs) / 0.87962566103423978  # 0.88: the std of a normal cut at ±2 (as in Keras)
             nn.init.trunc_normal_(linear.weight, 0, std, -2 * std, 2 * std)
             nn.init.zeros_(linear.bias)
             inputs = units
@@ -325,7 +325,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # The next update waits for `due` steps. A turn of this loop steps all environments, updates, or does both.
+            # The next update needs `due` steps in all. A turn of this loop steps all environments, updates, or both.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             if env_steps < due:
                 envs.step_async(agent.act(envs.observations))
