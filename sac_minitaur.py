@@ -53,7 +53,7 @@ class Config:
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
-    adam_beta1: common.Below1 = 0.5  # ours, as in CrossQ, there not for α (theirs: 0.9): Adam's β1
+    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but there not for α
     privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
@@ -95,7 +95,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# Shapes: B batch, K environments, N stored, O numbers observed, S = O and the privileged ones, A of an action
+# Shapes: B batch, K environments, N stored, O numbers observed, S these and the privileged ones, A numbers of an action
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -165,7 +165,7 @@ class Policy(nn.Module):
         self.action_space = action_space
         sizes = math.prod(observation_space.shape), math.prod(action_space.shape)
         self.actor = Actor(*sizes, config.actor_layers)
-        self.register_buffer("low", torch.tensor(action_space.low, dtype=torch.float32))  # a copy, to load into
+        self.register_buffer("low", torch.tensor(action_space.low, dtype=torch.float32))  # a copy: loading writes to it
         self.register_buffer("high", torch.tensor(action_space.high, dtype=torch.float32))
 
     def forward(self, observation):
@@ -340,8 +340,8 @@ class SACAgent(nn.Module):
         loss_q = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
         self._descend(self.critic_optimizer, loss_q, self.critics.buffers())
 
-        # The actor: α log π(a|s) − min Q(s, a) falls, with a ~ π(·|s). α falls while the entropy is above its target.
-        # α is constant in the actor's loss, log π in α's loss: each moves its own parameters only.
+        # The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s). α falls while the entropy is above its target.
+        # α is detached in the actor's loss, log π in α's. So one backward pass of the sum gives each its own gradient.
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
@@ -358,7 +358,7 @@ class SACAgent(nn.Module):
     def _descend(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # the actor's loss passes through the critics and leaves them no gradient
+        loss.backward(inputs=parameters)  # not the critics', through which the actor's loss passes
         # Several processes: the mean of their gradients, and of batch normalization's running statistics.
         statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]  # not the count of batches
         self.ranks.average([parameter.grad for parameter in parameters] + statistics)
@@ -375,8 +375,8 @@ def follow(average, module, tau):
 def cuda_graph(agent):
     """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, and every later call replays that.
 
-    The numbers stay the same. Without it, the GPU waits for Python between hundreds of small operations. But a replay
-    runs no Python code: what Python reads, computes or decides in `update` stays as it was recorded. Raises InputError
+    Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. But a
+    replay runs no Python: what Python reads, computes or decides in `update` stays as recorded. Raises InputError
     where there is no GPU, or more than one process.
     """
     if agent.device.type != "cuda" or agent.ranks.world_size > 1:
@@ -396,8 +396,8 @@ def cuda_graph(agent):
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
                 group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
-        for old, new in zip(recorded, batch):
-            old.copy_(new)
+        for graph_input, values in zip(recorded, batch):
+            graph_input.copy_(values)  # a replay reads its batch from the recorded tensors
         graph.replay()
         return metrics
 
@@ -463,7 +463,7 @@ def train(config):
             if run.stop_requested(step):
                 break
 
-            # The next update waits for `due` steps. A turn of this loop steps all environments, updates, or does both.
+            # The next update needs `due` steps in all. A turn of this loop steps all environments, updates, or both.
             # The physics runs beside the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = env_steps < due
@@ -530,7 +530,7 @@ class MinitaurBulletEnv(gym.Env):
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
     orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
-    Reward: metres forward in this step less 0.005 × |observed torques · motor velocities| in W × 0.002 s, not 0.01 s.
+    Reward: metres forward in this step less 0.005 × |observed torques · motor velocities| in W × 0.002 s (one substep).
     Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
     """
 
@@ -594,7 +594,7 @@ class MinitaurBulletEnv(gym.Env):
             simulator.resetJointState(robot, knee, direction * self.KNEE_ANGLE)
             for free in (motor, knee):  # pybullet's own velocity motor brakes every joint until it is given no force
                 simulator.setJointMotorControl2(robot, free, simulator.VELOCITY_CONTROL, force=0)
-        pin = simulator.JOINT_POINT2POINT, (0, 0, 0), (0, 0.005, 0.2), (0, 0.01, 0.2)
+        pin = simulator.JOINT_POINT2POINT, (0, 0, 0), (0, 0.005, 0.2), (0, 0.01, 0.2)  # type, axis, place on each shin
         for left, right in zip(knee_joints[::2], knee_joints[1::2]):
             simulator.createConstraint(robot, right, robot, left, *pin)
 
@@ -684,7 +684,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # its finalizer disconnects, and only once: a newer simulation may have this number
+        self.simulator = None  # its finalizer disconnects, and only once: a later simulation may reuse its number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
