@@ -543,15 +543,15 @@ class MinitaurBulletEnv(gym.Env):
     LEG_LINKS = (2, 3, 5, 6, 8, 9, 11, 12, 15, 16, 18, 19, 21, 22, 24, 25)
     MOTOR_LINKS = (1, 4, 7, 10, 14, 17, 20, 23)
     FOOT_LINKS = (3, 6, 9, 12, 16, 19, 22, 25)
-    KNEE_ANGLE = -2.1834
-    KP, KD = 1.0, 0.02
-    RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0
-    MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7
+    KNEE_ANGLE = -2.1834  # rad, in the start pose
+    KP, KD = 1.0, 0.02  # PWM duty per rad and per rad/s
+    RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0  # Ω, N·m/A, V
+    MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7  # V, N·m
     # Motor torque in N·m at currents of 0, 10, … 60 A: the iron saturates.
     CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])
     TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])
-    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500
-    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13
+    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500  # N·m; after more substeps in a row above it a motor stays off
+    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13  # cosine of the base's tilt, m
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
