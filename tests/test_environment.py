@@ -44,18 +44,16 @@ def random_actions(seed, hold=1):
 @contextlib.contextmanager
 def old_gym():
     """Stands in for the retired packages that pybullet_envs imports, and takes all it imported out again."""
-    names = "gym gym.spaces gym.utils gym.utils.seeding pkg_resources pybullet_envs pybullet_envs.bullet".split()
-    stubs = {name: types.ModuleType(name) for name in names}
-    stubs["gym"].__version__, stubs["gym"].Env = "0.21.0", object
-    stubs["gym"].spaces, stubs["gym"].utils = stubs["gym.spaces"], stubs["gym.utils"]
-    stubs["gym.spaces"].Box = lambda low, high, dtype: gym.spaces.Box(low.astype(dtype), high.astype(dtype))
-    stubs["gym.utils"].seeding = stubs["gym.utils.seeding"]
-    stubs["gym.utils.seeding"].np_random = lambda seed=None: (np.random.default_rng(seed), seed)
-    stubs["pkg_resources"].parse_version = lambda version: tuple(map(int, version.split(".")))
+    old = mock.Mock(__version__="0.21.0", Env=object)
+    old.spaces.Box = lambda low, high, dtype: gym.spaces.Box(low.astype(dtype), high.astype(dtype))
+    old.utils.seeding.np_random = lambda seed=None: (np.random.default_rng(seed), seed)
+    stubs = {"gym": old, "gym.spaces": old.spaces, "gym.utils": old.utils, "gym.utils.seeding": old.utils.seeding}
+    stubs["pkg_resources"] = mock.Mock(parse_version=lambda version: tuple(map(int, version.split("."))))
     # The packages' own __init__ would register every environment with the old gym.
     folder = Path(importlib.util.find_spec("pybullet_envs").submodule_search_locations[0])
-    stubs["pybullet_envs"].__path__ = [str(folder)]
-    stubs["pybullet_envs.bullet"].__path__ = [str(folder / "bullet")]
+    for name, path in (("pybullet_envs", folder), ("pybullet_envs.bullet", folder / "bullet")):
+        stubs[name] = types.ModuleType(name)
+        stubs[name].__path__ = [str(path)]
     with mock.patch.dict(sys.modules, stubs), mock.patch.object(sys, "path", sys.path.copy()):
         yield
 
@@ -78,14 +76,14 @@ class Pair:
         minitaur.SetMotorViscousDamping(dynamics.viscous_damping)
         minitaur.SetFootFriction(dynamics.foot_friction)
 
-    def play(self, seed, act, dtype, num_steps=None, options=None):
+    def play(self, seed, act, dtype, num_steps=None):
         """Steps both and compares: to the end of the episode, or for `num_steps` whatever happens.
 
-        Returns the number of steps, and whether and when the robot fell and a motor was switched off.
+        Returns the number of steps, and those at which the robot was down and a motor was switched off.
         """
-        observation, _ = self.env.reset(seed=seed, options=options)
+        observation, _ = self.env.reset(seed=seed)
         assert_same_observation(observation, self.original.reset())
-        fell_at = overheated_at = None
+        fallen, overheated = [], []
         for step in range(num_steps or 1000):
             action = act(step).astype(dtype)
             observation, reward, terminated, truncated, _ = self.env.step(action)
@@ -95,13 +93,11 @@ class Pair:
             assert truncated == (step + 1 >= 1000)
             motors = self.original.minitaur._motor_enabled_list
             assert self.env.unwrapped.motor_enabled.tolist() == motors
-            if terminated and fell_at is None:
-                fell_at = step
-            if not all(motors) and overheated_at is None:
-                overheated_at = step
+            fallen += [step] * terminated
+            overheated += [step] * (not all(motors))
             if num_steps is None and (terminated or truncated):
                 break
-        return step + 1, fell_at, overheated_at
+        return step + 1, fallen, overheated
 
     def close(self):
         self.env.close()
@@ -136,20 +132,15 @@ float64 = pytest.param(np.float64, id="float64")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_equals_the_original_with_random_actions(pair, seed, dtype):
     pair.play(seed, random_actions(seed), dtype, num_steps=60)
-    steps, fell_at, _ = pair.play(seed, random_actions(seed, hold=10), dtype)
-    assert fell_at == steps - 1 and steps < 500
+    steps, fallen, _ = pair.play(seed, random_actions(seed, hold=10), dtype)
+    assert fallen == [steps - 1] and steps < 500
 
 
 @numpy_2
 def test_equals_the_original_over_a_whole_walk(pair):
-    steps, fell_at, _ = pair.play(0, trot, np.float32)
-    assert steps == 1000 and fell_at is None  # so the time limit ended it
+    steps, fallen, _ = pair.play(0, trot, np.float32)
+    assert steps == 1000 and not fallen  # so the time limit ended it
     assert pair.env.unwrapped.x > 1  # and it was a walk
-
-
-def test_equals_the_original_walking_with_float64_actions(pair):
-    steps, fell_at, _ = pair.play(4, trot, np.float64, num_steps=300)
-    assert fell_at is None
 
 
 def test_equals_the_original_with_whole_numbers(pair):
@@ -163,16 +154,10 @@ def test_equals_the_original_with_whole_numbers(pair):
 
 
 def test_equals_the_original_when_motors_overheat(pair):
-    _, fell_at, overheated_at = pair.play(0, crouch, np.float64, num_steps=220)
-    assert overheated_at is not None and 100 < overheated_at < 200  # the steps after the switch-off are compared too
+    _, _, overheated = pair.play(0, crouch, np.float64, num_steps=220)
+    assert 100 < overheated[0] < 200  # the steps after the switch-off are compared too
     # The next reset switches the motors on again, in both.
-    assert pair.play(0, trot, np.float64, num_steps=20)[2] is None
-
-
-def test_equals_the_original_with_dynamics_of_ones_own(pair):
-    dynamics = sac_minitaur.Dynamics(3.0, 0.1, 0.3, 15.0, 0.005, 1.0)
-    pair.play(0, trot, np.float64, num_steps=50, options={"dynamics": dynamics})
-    assert pair.env.unwrapped.dynamics is dynamics
+    assert not pair.play(0, trot, np.float64, num_steps=20)[2]
 
 
 @pytest.mark.parametrize("value", [1.02, -1.02, np.nan, np.inf])
@@ -190,27 +175,21 @@ def test_draws_dynamics_in_their_ranges(env):
     simulator = env.unwrapped.simulator
     env.unwrapped._build()
     base, leg, motor = (simulator.getDynamicsInfo(env.unwrapped.robot, link)[0] for link in (-1, 2, 1))
-    ranges = {
-        "base_mass": (0.8 * base, 1.2 * base),
-        "leg_mass": (0.8 * leg, 1.2 * leg),
-        "motor_mass": (0.8 * motor, 1.2 * motor),
-        "voltage": (14.8, 16.8),
-        "viscous_damping": (0, 0.01),
-        "foot_friction": (0.8, 1.5),
-    }
+    ranges = dict(
+        base_mass=(0.8 * base, 1.2 * base), leg_mass=(0.8 * leg, 1.2 * leg), motor_mass=(0.8 * motor, 1.2 * motor),
+        voltage=(14.8, 16.8), viscous_damping=(0, 0.01), foot_friction=(0.8, 1.5),
+    )  # fmt: skip
     draws = []
     for seed in range(25):
         env.reset(seed=seed)
-        draws.append(dataclasses.asdict(env.unwrapped.dynamics))
-    assert list(draws[0]) == list(ranges)
-    for name, (low, high) in ranges.items():
-        values = np.array([draw[name] for draw in draws])
-        assert (low <= values).all() and (values <= high).all(), name
-        middle = (low + high) / 2
-        assert values.min() < middle < values.max(), name
+        draws.append([getattr(env.unwrapped.dynamics, name) for name in ranges])
+    least, most = np.min(draws, axis=0), np.max(draws, axis=0)
+    low, high = np.transpose(list(ranges.values()))
+    assert len(low) == len(dataclasses.fields(sac_minitaur.Dynamics))
+    assert (low <= least).all() and (most <= high).all()
+    assert (least < (low + high) / 2).all() and (most > (low + high) / 2).all()
     # The draws are independent of each other.
-    correlations = np.corrcoef(np.array([list(draw.values()) for draw in draws]).T)
-    assert np.abs(correlations - np.eye(6)).max() < 0.8
+    assert np.abs(np.corrcoef(np.transpose(draws)) - np.eye(6)).max() < 0.8
     # SI units: a robot of some 5 kg.
     assert 1 < base < 10 and 0.01 < leg < 1 and 0.05 < motor < 1
 
@@ -227,23 +206,18 @@ def rollout(env, seed, num_steps=60, options=None):
 
 
 def test_a_seed_fixes_the_episode(env):
-    first = rollout(env, seed=7)
-    dynamics = env.unwrapped.dynamics
-    other = rollout(env, seed=8)
-    assert rollout(env, seed=7) == first and env.unwrapped.dynamics == dynamics
-    assert other != first
-    # An unseeded reset goes on drawing from the same generator.
-    env.reset()
-    assert env.unwrapped.dynamics not in (dynamics, None)
-
-
-def test_a_used_simulator_gives_the_bits_of_a_fresh_one(env):
+    """In a used simulator, too."""
     env.reset(seed=1)
     for step in range(180):  # a robot on its back with a motor overheated
         env.step(crouch(step))
-    used = rollout(env, seed=5)
+    used = rollout(env, seed=7)
+    dynamics = env.unwrapped.dynamics
     with gym.make(ENV_ID) as fresh:
-        assert rollout(fresh, seed=5) == used
+        assert rollout(fresh, seed=7) == used and fresh.unwrapped.dynamics == dynamics
+    assert rollout(env, seed=8) != used
+    # An unseeded reset goes on drawing from the same generator.
+    env.reset()
+    assert env.unwrapped.dynamics not in (dynamics, None)
 
 
 def test_simulations_end_once_and_alone():
@@ -307,11 +281,6 @@ def test_privileged_observation_is_in_the_bodys_own_frame(env):
     np.testing.assert_allclose(privileged, [1, 2, 3, 4, 5, 6, 5], atol=1e-6)
 
 
-def test_spaces_are_those_of_the_original(pair):
-    assert pair.env.observation_space == pair.original.observation_space
-    assert pair.env.action_space == pair.original.action_space
-
-
 def test_spaces_are_those_that_the_tutorials_print(env):
     high = np.repeat(np.float32(["3.1515927", "167.72488", "5.71", "1.01"]), [8, 8, 8, 4])
     space = env.observation_space
@@ -327,18 +296,6 @@ def test_passes_gymnasiums_check():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gym.make(ENV_ID).unwrapped)
-
-
-def test_renders_without_a_display(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with gym.make(ENV_ID, render_mode="rgb_array") as env:
-        env.reset(seed=0)
-        standing = env.render()
-        assert standing.shape == (360, 480, 3) and standing.dtype == np.uint8
-        assert standing.std() > 5
-        for step in range(10):
-            env.step(trot(step).astype(np.float32))
-        assert (env.render() != standing).any()
 
 
 def run_python(code, cwd):
