@@ -61,57 +61,42 @@ def gradients_of_update(module, ranks):
 
 
 def save_gradients(module, directory):
-    """Makes the gradients of both scripts' agents the run."""
+    """Makes the gradients of both scripts' agents the run, and the directory that it would have."""
 
     def main():
-        ranks = common.Ranks()
-        gradients = {name: gradients_of_update(sys.modules[name], ranks) for name in SCRIPTS}
-        torch.save(gradients, f"{directory}/{ranks.rank}.pt")
+        run = common.Run(module.Config(device="cpu"), module.__name__, None, None)
+        found = {name: gradients_of_update(sys.modules[name], run.ranks) for name in SCRIPTS}
+        torch.save(found | {"path": str(run.path)}, f"{directory}/{run.ranks.rank}.pt")
 
     module.main = main
 
 
 @pytest.mark.parametrize("world_size", (2, 3))
 def test_averaged_gradients_equal_those_of_the_joined_batch(world_size, tmp_path):
+    """And all ranks name the same new directory."""
     for count in (1, world_size):
         (tmp_path / str(count)).mkdir()
         hook = partial(save_gradients, directory=tmp_path / str(count))
         end(start_ranks(count, SCRIPTS[0], [], tmp_path / f"output{count}", hook))
     expected = torch.load(tmp_path / "1" / "0.pt")
-    for rank in range(world_size):
-        averaged = torch.load(tmp_path / str(world_size) / f"{rank}.pt")
+    ranks = [torch.load(tmp_path / str(world_size) / f"{rank}.pt") for rank in range(world_size)]
+    for averaged in ranks:
+        assert averaged["path"] == ranks[0]["path"] and averaged["path"].startswith(f"runs/{SCRIPTS[0]}-")
         for name in SCRIPTS:
             assert all(gradient.abs().max() > 0 for gradient in expected[name])
             for gradient, right in zip(averaged[name], expected[name], strict=True):
                 torch.testing.assert_close(gradient, right, rtol=1e-5, atol=1e-6 * float(right.abs().max()))
 
 
-def save_path(module, directory):
-    def main():
-        run = common.Run(module.Config(device="cpu"), module.__name__, None, None)
-        Path(f"{directory}/{run.ranks.rank}").write_text(str(run.path))
+def save_agents(module, directory):
+    """Saves each rank's agent, as it is at the end."""
+    finish = common.Run.finish
 
-    module.main = main
+    def save_and_finish(run, step, env_steps, agent, *more):
+        torch.save(agent.state_dict(), f"{directory}/{run.ranks.rank}.pt")
+        finish(run, step, env_steps, agent, *more)
 
-
-def test_all_ranks_name_the_same_new_directory(tmp_path):
-    end(start_ranks(2, "dqn_cartpole", [], tmp_path / "output", partial(save_path, directory=tmp_path)))
-    first, second = ((tmp_path / rank).read_text() for rank in "01")
-    assert first == second and first.startswith("runs/dqn_cartpole-")
-
-
-def save_agent_at(module, directory, count):
-    """Saves each rank's agent, as it is after that many updates."""
-    agent_class = getattr(module, AGENTS[module.__name__])
-    update, calls = agent_class.update, iter(range(1, 10**9))
-
-    def update_and_save(self, *arguments):
-        metrics = update(self, *arguments)
-        if next(calls) == count:
-            torch.save(self.state_dict(), f"{directory}/{self.ranks.rank}.pt")
-        return metrics
-
-    agent_class.update = update_and_save
+    common.Run.finish = save_and_finish
 
 
 def tiny(name, run_dir):
@@ -123,53 +108,39 @@ def trained(request, tmp_path_factory):
     """A run of N processes that was left alone: its directory, its processes and N."""
     script, world_size = request.param
     path = tmp_path_factory.mktemp(script)
-    hook = partial(save_agent_at, directory=path, count=200)
+    hook = partial(save_agents, directory=path)
     ranks = start_ranks(world_size, script, tiny(script, path / "run"), path / "output", hook)
     end(ranks)
     return path / "run", ranks, world_size
 
 
-@pytest.fixture(scope="module", params=SCRIPTS)
-def stopped(request, tmp_path_factory):
-    """A run of two processes, two environments each, of which the second alone was asked to stop; its directory."""
-    path = tmp_path_factory.mktemp(f"stopped_{request.param}")
+def test_all_ranks_stop_with_one_and_each_has_experience_of_its_own(script, tmp_path):
+    """Of two processes, two environments each, the second alone is asked to stop."""
     more = ["--num-envs", 2, "--num-iterations", 10**6, "--replay-buffer-capacity", 10**6]
-    ranks = start_ranks(2, request.param, flags(request.param, path / "run", *more), path / "output")
-    wait_until((path / "run" / "train.csv").exists, seconds=600)
+    ranks = start_ranks(2, script, flags(script, tmp_path / "run", *more), tmp_path / "output")
+    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
     ranks[1].kill(signal.SIGTERM)
     end(ranks)
-    assert f"torchrun --nproc-per-node 2 {request.param}.py --resume " in ranks[0].stdout
-    return path / "run"
-
-
-def test_all_ranks_stop_with_one_and_each_has_experience_of_its_own(stopped):
-    state = checkpoint(stopped)
-    ranks = state["ranks"]
-    assert 0 < state["step"] < 10**6 and len(ranks) == 2
-    first = [tuple(row[:3].tolist()) for own in ranks for row in own["buffer"]["rows"][:2]]
+    assert f"torchrun --nproc-per-node 2 {script}.py --resume " in ranks[0].stdout
+    state = checkpoint(tmp_path / "run")
+    assert 0 < state["step"] < 10**6 and len(state["ranks"]) == 2
+    assert sum(len(own["buffer"]["rows"]) for own in state["ranks"]) == state["env_steps"]  # the counts are right
+    first = [tuple(row[:3].tolist()) for own in state["ranks"] for row in own["buffer"]["rows"][:2]]
     assert len(set(first)) == 4  # the first observations of the four environments
-    assert not torch.equal(*(own["random"]["cpu"] for own in ranks))
+    assert not torch.equal(*(own["random"]["cpu"] for own in state["ranks"]))
 
 
-def test_parameters_are_the_same_on_all_ranks(trained):
-    """To the last bit after 200 updates, although each has experience of its own."""
-    run_dir, _, world_size = trained
+def test_all_ranks_train_one_agent_and_rank_0_alone_prints_and_writes(trained):
+    """The same parameters to the last bit after 240 updates, although each rank has experience of its own."""
+    run_dir, ranks, world_size = trained
     agents = [torch.load(run_dir.parent / f"{rank}.pt") for rank in range(world_size)]
     for agent in agents[1:]:
         assert_same(agent, agents[0])
-
-
-def test_rank_0_alone_prints_and_writes(trained):
-    run_dir, ranks, _ = trained
     assert "finished" in ranks[0].stdout
     assert all(rank.stdout == "" for rank in ranks[1:])
     assert all(rank.stderr == "" for rank in ranks), [rank.stderr for rank in ranks]
     assert len(list(run_dir.glob("events.*"))) == 1
-
-
-def test_collect_ratio_holds_over_all_ranks(trained):
-    """Two environment steps for each update, of all environments of all processes, after the initial ones."""
-    run_dir, _, world_size = trained
+    # Two environment steps for each update, of all environments of all processes, after the initial ones.
     for step, env_steps in (map(int, row[:2]) for row in rows(run_dir / "train.csv")[1:]):
         assert 96 + 2 * step <= env_steps < 96 + 2 * step + 2 * (2 * world_size), (step, env_steps)
 
@@ -192,14 +163,6 @@ def test_killed_and_resumed_exactly_with_as_many_processes(trained, tmp_path):
 def kill_rank_1(module):
     if os.environ["RANK"] == "1":
         before_update(module, 130, die)
-
-
-def test_two_processes_solve_cartpole(tmp_path):
-    """By 5 000, as each of the ten seeds that README reports does with one process."""
-    arguments = ["--device", "cpu", "--no-video", "--num-iterations", 5000, "--run-dir", tmp_path / "run"]
-    end(start_ranks(2, "dqn_cartpole", arguments, tmp_path / "output"))
-    header, *evaluations = rows(tmp_path / "run" / "eval.csv")
-    assert max(float(row[header.index("average_return")]) for row in evaluations) >= 195
 
 
 def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
@@ -228,15 +191,10 @@ def test_torchrun_ends_when_a_rank_is_killed(tmp_path):
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    ranks = {rank_of(pid): int(pid) for pid in children if rank_of(pid)}
-    os.kill(ranks["1"], signal.SIGKILL)
+    ranks = [int(pid) for pid in children if b"\0RANK=" in Path(f"/proc/{pid}/environ").read_bytes()]
+    os.kill(ranks[1], signal.SIGKILL)
     _, errors = process.communicate(timeout=300)
     assert process.returncode != 0
     assert "error: lost another process" in errors or "SIGKILL" in errors
-    wait_until(lambda: not session(ranks["0"]) and not session(ranks["1"]), seconds=60)  # one session per rank
+    wait_until(lambda: not any(map(session, ranks)), seconds=60)  # one session per rank
     assert len(checkpoint(tmp_path / "run")["ranks"]) == 2
-
-
-def rank_of(pid):
-    entries = Path(f"/proc/{pid}/environ").read_text().split("\0")
-    return dict(entry.split("=", 1) for entry in entries if "=" in entry).get("RANK")
