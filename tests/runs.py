@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = ("sac_minitaur", "dqn_cartpole")
@@ -88,6 +89,14 @@ def finish(script, arguments, output, hook=None):
     run = Process(script, arguments, output, hook)
     assert run.wait() == 0, run.stderr
     return run
+
+
+def read_command_line(script, *arguments):
+    """The config that these arguments of the script ask for."""
+    import common
+
+    with mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)]):
+        return common.read_command_line(importlib.import_module(script).Config, "")
 
 
 def wait_until(condition, seconds):
