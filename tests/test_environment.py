@@ -93,8 +93,10 @@ class Pair:
             assert truncated == (step + 1 >= 1000)
             motors = self.original.minitaur._motor_enabled_list
             assert self.env.unwrapped.motor_enabled.tolist() == motors
-            fallen += [step] * terminated
-            overheated += [step] * (not all(motors))
+            if terminated:
+                fallen.append(step)
+            if not all(motors):
+                overheated.append(step)
             if num_steps is None and (terminated or truncated):
                 break
         return step + 1, fallen, overheated

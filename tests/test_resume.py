@@ -309,7 +309,7 @@ def test_every_other_change_is_refused(script, reference):
     for field in set(vars(config)) - {"resume", "evaluate"}:
         continued = copy.copy(config)
         value = {"device": "auto", "num_iterations": 301}.get(field, "another")
-        object.__setattr__(continued, field, value)  # unchecked: hardly a field takes that
+        object.__setattr__(continued, field, value)  # unchecked: few fields take such a value
         if field in ("video", "checkpoint_interval", "num_iterations", "device", "num_threads", "cuda_graph"):
             common.Run(continued, script, None, None)
         else:
@@ -335,6 +335,16 @@ def test_a_run_on_a_gpu_continues_exactly(script, reference, tmp_path):
     assert_same_run(run, whole)
     module.train(module.Config(resume=run, num_iterations=310, device="cpu", **without))
     assert checkpoint(run)["step"] == 310
+
+
+def test_where_processes_are_spawned(reference, script, tmp_path):
+    """As on macOS and Windows."""
+    finish(script, flags(script, tmp_path / "run", "--num-envs", 2), tmp_path / "output", spawn)
+    assert_same_run(tmp_path / "run", reference)
+
+
+def spawn(module):
+    common.START_METHOD = "spawn"
 
 
 def test_minitaur_resumes_exactly(tmp_path):
