@@ -502,6 +502,8 @@ class Run:
         """`evaluate(policy, task, seed)` plays one episode in a worker process and returns its return and length."""
         if multiprocessing.current_process().daemon:
             raise InputError("a daemon, as a Pool's worker is, cannot train: use multiprocessing.Process(daemon=False)")
+        if config.evaluate is not None:
+            raise InputError("train does not evaluate a saved policy: the command line does, with --evaluate")
         self.config, self.script, self.task, self.evaluate_episode = config, script, task, evaluate
         self.ranks, self.checkpoint = Ranks(), {}
         self.writes = self.ranks.rank == 0
@@ -584,7 +586,9 @@ class Run:
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
         module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
-        file = Path(getattr(module, "__file__", f"{self.script}.py"))
+        if not hasattr(module, "__file__"):  # a notebook's cells
+            return f"to continue from the last checkpoint: train(Config(resume={str(self.path)!r}))"
+        file = Path(module.__file__)
         program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
@@ -715,7 +719,7 @@ class Run:
         table = "eval" if policy else "random"
         if not self.writes or any(row["step"] == step for row in self.tables[table][-1:]):
             return
-        policy = policy and copy.deepcopy(policy).cpu()
+        policy = policy and copy.deepcopy(policy).cpu().eval()  # a fork may have dropout
         seeds = [(seed,) for seed in evaluation_seeds(self.config)]
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
         while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
@@ -793,7 +797,7 @@ class Run:
             plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
         if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
-        policy, films = copy.deepcopy(agent.policy).cpu(), {}
+        policy, films = copy.deepcopy(agent.policy).cpu().eval(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
             learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]
@@ -844,7 +848,7 @@ def summarize(results):
 def evaluate_policy(config, script, policy, task, evaluate):
     """What --evaluate PATH does: plays the episodes that its run was evaluated with, tells the returns, films one."""
     try:
-        policy.load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
+        policy.eval().load_state_dict(read_file(config.evaluate, "policy", script)["weights"])
     except RuntimeError:
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
     torch.set_num_threads(1)  # as in a run's evaluation: the same digits

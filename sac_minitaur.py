@@ -367,9 +367,11 @@ class SACAgent(nn.Module):
 
 @torch.no_grad()
 def follow(average, module, tau):
-    """Moves the parameters of `average` by the fraction `tau` towards those of `module`."""
+    """Moves the parameters of `average` by the fraction `tau` towards those of `module`, and copies its buffers."""
     for mean, parameter in zip(average.parameters(), module.parameters()):
         mean.lerp_(parameter, tau)
+    for mine, buffer in zip(average.buffers(), module.buffers()):
+        mine.copy_(buffer)  # the running statistics, where a fork's actor has batch normalization
 
 
 def cuda_graph(agent):

@@ -1,5 +1,6 @@
 """Damaged and hostile files, full disks, dead workers, odd consoles, losses that are not numbers: one line."""
 
+import importlib
 import io
 import math
 import multiprocessing
@@ -16,7 +17,7 @@ import threading
 import zipfile
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 import gymnasium as gym
@@ -126,6 +127,9 @@ def test_checkpoint_of_another_version(script, copy):
 def test_what_resume_and_evaluate_do_not_take(script, reference):
     resume, evaluate = ["--resume", reference], ["--evaluate", reference / "policy.pt"]
     assert "give one of them" in refusal(script, *resume, *evaluate)
+    module = importlib.import_module(script)
+    with pytest.raises(common.InputError, match="train does not evaluate"):
+        module.train(module.Config(evaluate=reference / "policy.pt"))
     other = SCRIPTS[1 - SCRIPTS.index(script)]
     assert f"is a checkpoint of {script}" in refusal(other, *resume)
     assert f"is a policy of {script}" in refusal(other, *evaluate)
@@ -156,6 +160,28 @@ def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
     more = ["--num-eval-episodes", 1, "--seed", 9]
     run = finish(script, ["--evaluate", reference / "best_policy.pt", "--no-video", *more], tmp_path / "one")
     assert "+/- 0.000000, Average" in run.stdout
+
+
+def test_a_forks_dropout_acts_in_no_evaluation(script, tmp_path):
+    """Not in the run's own, not by --evaluate, not exported."""
+    few = "--num-iterations", 40, "--eval-interval", 40
+    finish(script, flags(script, run := tmp_path / "run", *few), tmp_path / "trained", with_dropout)
+    evaluate = ["--evaluate", run / "policy.pt", "--no-video"]
+    output = finish(script, evaluate, tmp_path / "evaluated", with_dropout).stdout
+    assert f"AverageReturn = {read_csv(run / 'eval.csv')[-1]['average_return']:.6f}" in output
+    policy = torch.export.load(run / "policy.pt2").module()
+    batch = torch.randn(100, 4 if script == "dqn_cartpole" else 3)
+    assert torch.equal(policy(batch), policy(batch))
+
+
+def with_dropout(module):
+    init = module.Policy.__init__
+
+    def init_with_dropout(self, *arguments):
+        init(self, *arguments)
+        (self.q_network if module is dqn_cartpole else self.actor).net.insert(1, torch.nn.Dropout())
+
+    module.Policy.__init__ = init_with_dropout
 
 
 def test_exported_policies_run_without_this_project(script, reference, tmp_path):
@@ -420,6 +446,15 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
     hint = output.splitlines()[-1].partition("checkpoint: ")[2]
     named = program if program == "my dqn.py" else f"{here}/{program}"
     assert shlex.split(hint) == ["python", named, "--resume", "a run"]
+
+
+def test_the_hint_of_a_notebooks_cells(script, reference, monkeypatch):
+    """They have no file that a command could run."""
+    config = importlib.import_module(script).Config(resume=reference)
+    monkeypatch.setattr(type(config), "__module__", "__main__")
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))
+    hint = common.Run(config, script, None, None)._how_to_continue()
+    assert hint == f"to continue from the last checkpoint: train(Config(resume='{reference}'))"
 
 
 def test_dead_environment_worker(tmp_path):

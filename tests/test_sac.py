@@ -244,6 +244,14 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
         assert not torch.equal(own, before) and own.grad is None
 
 
+def test_a_forks_normalized_actor_is_evaluated_with_its_statistics():
+    module = nn.Sequential(nn.BatchNorm1d(3), nn.Linear(3, 2))
+    average = copy.deepcopy(module)
+    module(torch.rand(8, 3))
+    sac_minitaur.follow(average, module, 0.5)
+    assert module[0].running_mean.all() and torch.equal(average[0].running_mean, module[0].running_mean)
+
+
 def test_act_samples_or_takes_the_mean():
     agent = make_agent()
     agent.update(make_batch())  # so that the averaged actor is not the actor
