@@ -371,6 +371,8 @@ class Environments:
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         if here:
             signal.signal(signal.SIGINT, handler)
+        for process in getattr(self.vector, "processes", []):
+            run.stack.callback(process.kill)  # after `close`, also where Ctrl-C ends that
         run.stack.callback(self.close)
         (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
@@ -417,8 +419,6 @@ class Environments:
         deadline = time.perf_counter() + 10  # for all together: a simulator may take seconds to end
         for process in getattr(self.vector, "processes", []):
             process.join(max(0, deadline - time.perf_counter()))
-            process.kill()
-            process.join()
             self.vector.closed = True
         self.vector.close()
 

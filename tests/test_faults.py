@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -496,6 +497,21 @@ def test_workers_end_with_the_main_process(script, tmp_path):
     assert len(session(run.pid)) > 1
     run.kill()
     assert run.wait() == -signal.SIGKILL
+
+
+def test_a_second_interrupt_does_not_wait_for_a_task_that_does_not_close(tmp_path):
+    arguments = flags("sac_minitaur", tmp_path / "run", "--num-iterations", 10**6)
+    run = Process("sac_minitaur", arguments, tmp_path / "output", never_close)
+    wait_until((tmp_path / "run" / "train.csv").exists, 60)
+    run.kill(signal.SIGINT)
+    wait_until(lambda: "stopped at step" in run.stdout, 60)
+    run.kill(signal.SIGINT)
+    assert run.wait(9) == 130 and "Traceback" not in run.stderr  # within the ten seconds that a task has to close
+
+
+def never_close(module):
+    """Once an episode has begun: gymnasium closes one environment before."""
+    common.SeededEpisodes.close = lambda env: time.sleep(600 * hasattr(env, "total"))
 
 
 def test_interrupted_evaluation_of_a_policy(script, copy, tmp_path):
