@@ -31,7 +31,7 @@ class Echo(gym.Env):
 
     def __init__(self, low=-1, high=1, dtype=np.float32, in_place=False, fails=None, error=None, observations=None):
         self.observation_space = observations or gym.spaces.Box(-np.inf, np.inf, (2,))
-        self.action_space = gym.spaces.Box(low, high, (1,), dtype)
+        self.action_space = gym.spaces.Box(low, high, np.shape(low) or (1,), dtype)
         self.in_place, self.fails, self.error = in_place, fails, error
         self.state = np.zeros(2, np.float32)
 
@@ -67,65 +67,25 @@ class Unrepeatable(Echo):
         return observation + self.error_of_observations, reward + self.error_of_rewards, done, False, {}
 
 
-class Helpers:
-    """A program, as a simulator that is a server, and a forked process. Both run until the task ends them."""
+class Helped(gym.Wrapper):
+    """It starts a program, as a simulator that is a server, and a forked process. Both run until it ends them."""
 
-    def __init__(self):
+    def __init__(self, env_id):
+        super().__init__(gym.make(env_id))
         self.program = subprocess.Popen(["sleep", "600"])
         self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
         self.process.start()
 
-    def end(self):
-        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
-            each.terminate()
-            wait()
-
-
-class Starts(Echo):
-    """Starts helpers and ends them. `pids` is a file."""
-
-    def __init__(self, pids):
-        super().__init__()
-        self.helpers = Helpers()
-        with open(pids, "a") as file:
-            file.write(f"{self.helpers.program.pid} {self.helpers.process.pid} ")
-
-    def close(self):
-        self.helpers.end()
-
-
-class Helped(gym.Wrapper):
-    """CartPole that needs its helpers."""
-
-    def __init__(self, **options):
-        super().__init__(gym.make("CartPole-v1", **options))
-        self.helpers = Helpers()
-
     def step(self, action):
-        assert self.helpers.program.poll() is None and self.helpers.process.is_alive()
         observation, *_ = self.env.step(action)
         return observation, 1.0, False, False, {}  # its time limit alone ends an episode
 
     def close(self):
-        self.helpers.end()
-
-
-class Moves(gym.Wrapper):
-    """Goes to a directory of its own, where its files lie, at its start or at a step."""
-
-    def __init__(self, env, path, steps):
-        super().__init__(env)
-        self.path, self.steps = path, steps
-        self._count()
-
-    def _count(self):
-        if self.steps == 0:
-            os.chdir(self.path)
-        self.steps -= 1
-
-    def step(self, action):
-        self._count()
-        return self.env.step(action)
+        ran = self.program.poll() is None and self.process.is_alive()
+        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
+            each.terminate()
+            wait()
+        assert ran
 
 
 class TwoArguments(Exception):
@@ -137,7 +97,8 @@ class TwoArguments(Exception):
 
 gym.register("Echo-v0", entry_point=Echo, max_episode_steps=4)
 gym.register("Endless-v0", entry_point=Echo)
-gym.register("Helped-v0", entry_point=Helped)
+gym.register("HelpedBox-v0", entry_point=Helped, kwargs={"env_id": "Pendulum-v1"})
+gym.register("HelpedDiscrete-v0", entry_point=Helped, kwargs={"env_id": "CartPole-v1"})
 gym.register("Unrepeatable-v0", entry_point=Unrepeatable, max_episode_steps=100)
 IDS = {"env_id": f"{__name__}:Echo-v0"}
 
@@ -187,40 +148,27 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
 @pytest.mark.parametrize(
     "dtype, scale", [(np.float32, 10), (np.float32, 1.7e38), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)]
 )
-def test_actions_never_leave_the_bounds(dtype, scale):
+def test_actions_never_leave_the_bounds(dtype, scale, register):
     random = np.random.default_rng(0)
     low, high = np.sort(random.uniform(-scale, scale, (2, 300)).astype(dtype), axis=0)
     low[:2], high[:2] = (-1, 0.9 * scale), (0.2, scale)  # one rounding out, and an overflow of their sum
     space = gym.spaces.Box(low, high, dtype=dtype)
     policy = Policy(Config(actor_layers=()), gym.spaces.Box(-1, 1, (1,)), space)
-    received = []
-
-    class Task(gym.Env):
-        observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), space
-
-        def reset(self, *, seed=None, options=None):
-            return np.zeros(1, np.float32), {}
-
-        def step(self, action):
-            received.append(action)
-            return np.zeros(1, np.float32), 0.0, False, False, {}
-
     policy.load_state_dict(policy.state_dict() | {"low": torch.full((300,), -1e9)})  # the task's own bounds stay
     assert np.array_equal(space.low, low)
     policy.load_state_dict(policy.state_dict() | {"low": torch.from_numpy(low.astype(np.float32))})
-    env = sac_minitaur.make_training_env(gym.envs.registration.EnvSpec("Task-v0", Task), False)
-    env.reset()
+    env = sac_minitaur.make_training_env(gym.spec(register(low=low, high=high, dtype=dtype)), False)
     for sign in (-1, 1, 0.999, -1e-3):
         with torch.no_grad():
             policy.actor.net[0].weight.zero_()
             policy.actor.net[0].bias.fill_(np.arctanh(sign) if abs(sign) < 1 else 100 * sign)
         acted, forward = policy.act(np.zeros(1)), policy(torch.zeros(2, 1))[1].detach().numpy()
-        env.step(np.full(300, sign, np.float32))
-        assert acted in space and received[-1] in space
+        received = env.action(np.full(300, sign, np.float32))  # what its step gives to the task
+        assert acted in space and received in space
         assert (policy.low.numpy() <= forward).all() and (forward <= policy.high.numpy()).all()
         exact = low.astype(float) + (high.astype(float) - low) * (1 + sign) / 2
         tolerance = (1e-2 if dtype == np.float16 else 1e-5) * scale
-        for actions in (acted, received[-1], forward):
+        for actions in (acted, received, forward):
             np.testing.assert_allclose(actions, exact, rtol=0, atol=tolerance)
     assert env.action_space == gym.spaces.Box(-1, 1, (300,))
 
@@ -249,18 +197,19 @@ def test_a_task_that_wraps_another(register):
         assert env.observation_space == observation_space
 
 
-@pytest.mark.parametrize("layout", [lambda array: array[::-1], lambda array: array.astype(">f4"), np.longdouble, list])
-def test_observations_of_every_layout(layout, monkeypatch, tmp_path):
-    monkeypatch.setattr(Echo, "_observation", lambda self: layout(self.state.copy()))
-    path, _ = train(tmp_path / "run", **SHORT, **IDS)
-    assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 4
-
-
-@pytest.mark.parametrize("kind, scale", [(np.uint8, 1 / 4), (np.int8, 200), (np.float16, 1e5)])
-def test_observations_are_stored_as_they_are_returned(kind, scale, monkeypatch, register, tmp_path):
-    """Though the type of their space could not hold them."""
+@pytest.mark.parametrize(
+    "kind, scale, layout",
+    [
+        (np.uint8, 1 / 4, lambda array: array[::-1].copy()[::-1]),
+        (np.int8, 200, lambda array: array.astype(">f4")),
+        (np.float16, 1e5, np.longdouble),
+        (np.float32, 1, list),
+    ],
+)
+def test_observations_are_stored_as_they_are_returned(kind, scale, layout, monkeypatch, register, tmp_path):
+    """In every layout, though the type of their space could not hold them."""
     right = Echo._observation
-    monkeypatch.setattr(Echo, "_observation", lambda self: scale * right(self))
+    monkeypatch.setattr(Echo, "_observation", lambda self: layout(scale * right(self)))
     path, _ = train(tmp_path / "run", **SHORT, env_id=register(observations=gym.spaces.Box(0, 9, (2,), kind)))
     rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
     assert rows[:, 0].unique().tolist() == [0, scale, 2 * scale, 3 * scale]
@@ -274,41 +223,33 @@ def test_a_task_that_draws_from_a_librarys_own_generator_draws_anew_in_every_wor
     assert len(rows[:, 0].unique()) == len(rows)
 
 
-@pytest.mark.parametrize("in_workers", [True, False])
-def test_the_program_that_a_task_starts_is_ended_with_it(in_workers, register, monkeypatch, tmp_path):
-    begin = common.Environments.__init__
-    monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=in_workers))
-    train(tmp_path / "run", **SHORT, env_id=register(Starts, pids=tmp_path / "pids"), num_envs=2)
-    pids = (tmp_path / "pids").read_text().split()
-    assert len(pids) >= 14 and not [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+@pytest.mark.parametrize("value", [np.nan, 1e39])  # which is too large for float32
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+def test_a_task_that_returns_a_reward_that_is_not_finite(value, monkeypatch, tmp_path):
+    step = Echo.step
+    monkeypatch.setattr(Echo, "step", lambda *args: (step(*args)[0], value, False, False, {}))
+    with pytest.raises(common.TaskError, match=r"it returned the reward (nan|1e\+39) .*: not all finite"):
+        train(tmp_path / "run", **SHORT, **IDS)
+
+
+SHAPE, FINITE = "the task failed: it returned an observation of shape .* its space has ", "inf.*: not all finite"
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize(
-    "where, value",  # 1e39 is too large for float32
-    [("reward", np.nan), ("reward", 1e39), ("observation", np.inf), ("observation", 1e39), ("first observation", 1e39)],
+    "when, wrong, said",
+    [
+        (0, np.zeros(3), SHAPE),
+        (3, np.float32(0), SHAPE),
+        (3, np.zeros((1, 2)), SHAPE),
+        (0, np.full(2, 1e39), FINITE),
+        (3, np.full(2, np.inf), FINITE),
+    ],
 )
-def test_a_task_that_returns_what_is_not_finite(where, value, monkeypatch, tmp_path):
-    step, reset = Echo.step, Echo.reset
-
-    def bad_step(self, action):
-        observation, reward, *more = step(self, action)
-        return (observation, value, *more) if where == "reward" else (np.full(2, value), reward, *more)
-
-    if where == "first observation":
-        monkeypatch.setattr(Echo, "reset", lambda self, **more: (np.full(2, value), reset(self, **more)[1]))
-    else:
-        monkeypatch.setattr(Echo, "step", bad_step)
-    shown = r"(1e\+39|inf)" if value == 1e39 else value
-    with pytest.raises(common.TaskError, match=f"the task failed: it returned the reward .*{shown}.*not all finite"):
-        train(tmp_path / "run", **SHORT, **IDS)
-
-
-@pytest.mark.parametrize("when, wrong", [(0, np.zeros(3)), (3, np.float32(0)), (3, np.zeros((1, 2)))], ids=np.shape)
-def test_a_task_that_returns_another_shape(when, wrong, monkeypatch, tmp_path):
+def test_a_task_that_returns_what_no_space_of_its_has(when, wrong, said, monkeypatch, tmp_path):
     right = Echo._observation
     monkeypatch.setattr(Echo, "_observation", lambda self: wrong if self.state[0] == when else right(self))
-    with pytest.raises(common.TaskError, match="it returned an observation of shape .* its space has "):
+    with pytest.raises(common.TaskError, match=said):
         train(tmp_path / "run", **SHORT, **IDS)
 
 
@@ -341,14 +282,17 @@ def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeyp
     assert not (tmp_path / "waited for").exists()
 
 
-def test_ctrl_c_stops_the_run_and_nothing_that_its_task_has_started(tmp_path):
-    """A terminal sends it to all. What the task starts is there until the task ends it."""
-    arguments = flags("dqn_cartpole", tmp_path / "run", "--env-id", f"{__name__}:Helped-v0", "--num-iterations", 10**6)
-    more = ["--max-episode-steps", 20, "--eval-interval", 10**6]
-    run = Process("dqn_cartpole", [*arguments, *more], tmp_path / "output")
+def test_ctrl_c_stops_the_run_and_nothing_that_its_task_has_started(script, tmp_path):
+    """A terminal sends it to all. What the task starts is there until the task ends it, and does not outlive the run.
+
+    It is in a worker, or with DQN in the training process.
+    """
+    task = f"{__name__}:Helped{'Box' if script == 'sac_minitaur' else 'Discrete'}-v0"
+    more = ["--num-iterations", 10**6, "--max-episode-steps", 20, "--eval-interval", 10**6]
+    run = Process(script, flags(script, tmp_path / "run", "--env-id", task, *more), tmp_path / "output")
     wait_until((tmp_path / "run" / "train.csv").exists, 60)
     os.killpg(run.pid, signal.SIGINT)
-    assert run.wait() == 0 and "stopped at step" in run.stdout, run.stderr
+    assert run.wait(60) == 0 and "stopped at step" in run.stdout, run.stderr
     assert run.stderr.count("stopping") == 1 and "Traceback" not in run.stderr
 
 
@@ -398,12 +342,13 @@ def test_train_in_a_thread(tmp_path):
     assert checkpoint(tmp_path / "run")["step"] == 20
 
 
-@pytest.mark.parametrize("steps", [0, 50])
-def test_a_task_that_changes_the_directory(steps, register, monkeypatch, tmp_path):
-    """The run lies where the user asked, and the film."""
+def test_a_task_that_changes_the_directory(register, monkeypatch, tmp_path):
+    """At its start and at every step. The run lies where the user asked, and the film."""
 
     def make(render_mode=None):
-        return Moves(gym.make("Pendulum-v1", render_mode=render_mode), tmp_path / "assets", steps)
+        os.chdir(tmp_path / "assets")
+        env = gym.make("Pendulum-v1", render_mode=render_mode)
+        return gym.wrappers.TransformReward(env, lambda reward: os.chdir(tmp_path / "assets") or reward)
 
     (tmp_path / "assets").mkdir()
     begin = common.Environments.__init__
@@ -457,14 +402,10 @@ def test_an_episode_that_cannot_be_played_again_on_resume(change, monkeypatch, t
     assert len(rows) == 40 + 40 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
 
 
-@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MinitaurBulletEnv-v0"])
 @pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
-def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
-    if env_id != "Pendulum-v1":
-        pytest.importorskip("pybullet")
-    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20} | fault
-    with pytest.raises(common.RunError, match="not finite") as caught:
-        train(tmp_path / "run", **choices, env_id=env_id)
+def test_a_diverged_actor_ends_the_run_in_one_line(fault, tmp_path):
+    with pytest.raises(common.RunError, match="the actor's actions are not finite") as caught:
+        train(tmp_path / "run", **SHORT | IDS | {"num_iterations": 200, "log_interval": 1000} | fault)
     assert len(str(caught.value).splitlines()) == 1
 
 
