@@ -389,7 +389,7 @@ def test_trains_on_without_a_console(tmp_path, hook):
     assert (tmp_path / "run" / "best_policy.pt2").exists() or hook is close_the_stream  # torch.export needs a stream
 
 
-@pytest.mark.parametrize("hook", [have_no_reader, have_no_streams])
+@pytest.mark.parametrize("hook", [have_no_reader, replace_stderr, have_no_streams])
 def test_evaluates_without_a_console(script, copy, tmp_path, hook):
     assert not finish(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", hook).stderr
     assert (copy / "policy.mp4").exists()
