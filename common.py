@@ -485,7 +485,7 @@ def say(line):
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python would complain at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # so that a fork's own `print` does not fail either
 
 
 class Run:

@@ -357,8 +357,9 @@ def have_no_reader(module):
 
 
 def lose_the_reader(module):
-    """As before `| head`, in the midst of it."""
+    """As before `| head`, in the midst of it. A fork prints then, too."""
     before_update(module, 50, partial(have_no_reader, module))
+    before_update(module, 100, partial(print, "a line"))
 
 
 def close_the_stream(module):
