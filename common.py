@@ -77,7 +77,7 @@ def run_main(main):
         return main()
     except (InputError, RunError, TaskError) as error:
         if os.environ.get("RANK", "0") != "0":
-            time.sleep(1)  # rank 0 mostly fails for the same reason: torchrun ends this one and one line is printed
+            time.sleep(1)  # rank 0 mostly fails alike, and torchrun then ends this process: one message is printed
         print(f"error: {error}", file=sys.stderr, flush=True)
         status = 2 if isinstance(error, InputError) else 1
     except KeyboardInterrupt:
@@ -102,17 +102,17 @@ Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
 def complete_config(given, config_class, tutorial, script):
-    """What `Config` is given, completed from the run to resume, from the policy to evaluate, or with `tutorial=True`
-    from `tutorial`. Raises InputError when a file is no good."""
+    """Completes what `Config` is given: from the run to resume, the policy to evaluate, or with `tutorial=True` from
+    `tutorial`. Raises InputError when a file is no good."""
     names = config_class.__dataclass_fields__.keys()
     values = dict(zip(names, given.args or ())) | (given.kwargs or {})
     rest = tutorial if values.get("tutorial") else {}
-    if names > values.keys():  # the command line gives all of them, completed before
+    if names > values.keys():  # not for the command line, which gives all, completed before
         if run := values.get("resume"):
             rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
             if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
                 raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
-        elif policy := values.get("evaluate"):  # it may be older than a fork's field
+        elif policy := values.get("evaluate"):  # it may lack a field that a fork added
             rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
     return ArgsKwargs((), rest | values)
 
@@ -222,8 +222,8 @@ class Ranks:
 def find_task(config, action_space):
     """The gymnasium spec of --env-id with a time limit, and its observation and action spaces.
 
-    Worker processes make the task from the spec: there it may not be registered. Raises InputError when it is unknown
-    or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
+    Worker processes make the task from the spec, because it may not be registered there. Raises InputError when it is
+    unknown or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
     """
     name = f"--env-id {config.env_id}"
     if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
@@ -232,8 +232,8 @@ def find_task(config, action_space):
     try:
         with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
             observations, actions = env.observation_space, env.action_space
-            # Not env.spec: it has wrappers of the task's own too, which gymnasium cannot always compare with new ones.
-            # Where a task makes another one within itself, it may be that one's. And it is None if it cannot be copied.
+            # Not env.spec. It has the task's own wrappers, which gymnasium cannot always compare with new ones. It may
+            # be the spec of another task that this one makes inside itself. And it is None where it cannot be copied.
             task = gym.registry[env.unwrapped.spec.id]
             limit = config.max_episode_steps or (env.spec or task).max_episode_steps
             task = dataclasses.replace(task, max_episode_steps=limit or 10_000)  # or an evaluation might never end
@@ -259,7 +259,7 @@ def find_task(config, action_space):
 
 @contextlib.contextmanager
 def telling_task_errors(who="the task"):
-    """Turns an exception of the task into a `TaskError`, which, unlike others, always comes through a pipe whole."""
+    """Turns an exception of the task into a `TaskError`: a worker can always send this one to the main process."""
     try:
         yield
     except RunError:
@@ -269,7 +269,7 @@ def telling_task_errors(who="the task"):
 
 
 def handle_in(process, act, number, frame):
-    """Handles a signal by `act` in this process only. What a task forks from it ignores Ctrl-C and can be ended."""
+    """Handles a signal by `act` in this process only. What a task forks ignores Ctrl-C, and other signals end it."""
     if os.getpid() == process:
         act(number, frame)
     elif number != signal.SIGINT:
@@ -277,7 +277,7 @@ def handle_in(process, act, number, frame):
 
 
 def start_worker(task=None):
-    """In a worker process: leaves to the main process the signals that a whole group is sent, and ends with it.
+    """Prepares a worker. It ends with the main process, to which it leaves the signals that all of them are sent.
 
     `task` is what an evaluation's worker plays.
     """
@@ -287,7 +287,7 @@ def start_worker(task=None):
     torch.seed()
     ignore = partial(handle_in, os.getpid(), lambda *_: None)
     for number in STOP_SIGNALS:
-        # A program that the task starts ignores Ctrl-C, too. The rest it does not inherit: the task can terminate it.
+        # A program that the task starts ignores Ctrl-C, too. Other signals end it: handlers are not inherited.
         signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else ignore)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
@@ -360,7 +360,7 @@ class Environments:
             with telling_task_errors():
                 return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
 
-        # It would show a task's error once more for each process.
+        # gymnasium would show a task's error once more for each process.
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
         kind = gym.vector.SyncVectorEnv
@@ -435,7 +435,7 @@ def write_atomically(path, write):
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except RuntimeError as error:  # torch.save's own after an OSError
+    except RuntimeError as error:  # torch.save's, which hides an OSError
         raise error.__context__ or error
     finally:
         temporary.unlink(missing_ok=True)
@@ -521,7 +521,7 @@ class Run:
             dist.broadcast_object_list(path)  # the others take rank 0's
         (self.path,) = path
         self.directory = self.path.absolute()  # a task may change the current one
-        # What the run has found; a snapshot is a caption and the policy's weights, for the film of how it learned.
+        # The results so far. A snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
         self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
         self.tables = self.found["tables"]
@@ -529,7 +529,7 @@ class Run:
         self.started = time.perf_counter() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
-        self.owner = os.urandom(16)  # in a file, until --resume in another process writes its own
+        self.owner = os.urandom(16)  # in .owner: another process that resumes the run writes its own
         self.stack = contextlib.ExitStack()
 
     def _require_same_run(self, saved):
@@ -547,7 +547,7 @@ class Run:
             raise InputError("this process trains already: start a process of its own for the other training")
         Run.training_process = os.getpid()
         with contextlib.ExitStack() as failing:
-            failing.push(self)  # what fails here is undone and told as later
+            failing.push(self)  # __exit__ handles what fails here, as it does later
             self.stack.callback(setattr, Run, "training_process", None)
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
@@ -578,7 +578,7 @@ class Run:
             reason = "a worker process died" if died else "lost another process: " * lost + first_line(error)
             raise RunError(f"{reason}; {self._how_to_continue()}") from error
         if isinstance(error, TaskError):
-            error.__cause__ = None  # the pool's: the same traceback once more
+            error.__cause__ = None  # it is the pool's, with the same traceback
             self.print(self._how_to_continue())
 
     def _how_to_continue(self):
@@ -607,10 +607,10 @@ class Run:
         return self.stopped
 
     def start(self, agent, buffer, environments):
-        """Restores the checkpoint, begins the files, saves one for a new config, and evaluates the random policy.
+        """Restores the checkpoint, begins the files, saves a checkpoint for a new config, evaluates the random policy.
 
-        Returns the gradient updates and the environment steps done so far. Nothing was written before: here all that
-        the user gave has been found usable.
+        Returns the gradient updates and the environment steps done so far. The run writes nothing before this: by now
+        all that the user gave is known to be usable.
         """
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
         if saved:
@@ -637,7 +637,7 @@ class Run:
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
         step, env_steps = self.saved_step, saved.get("env_steps", 0)
-        if plain_config(config) != saved.get("config"):  # a kill must lose no first steps, and no raised flag
+        if plain_config(config) != saved.get("config"):  # else a kill would lose the first steps, or a raised flag
             self.save(step, env_steps, agent, buffer, environments)
         self.evaluate(0, 0, policy=None)  # random actions, for comparison
         self.last_logged = time.perf_counter(), step
@@ -662,7 +662,7 @@ class Run:
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.directory.glob(name):
                 path.unlink(missing_ok=True)  # the run may still go on in another process
-        self.stack.enter_context(contextlib.suppress(OSError))  # of the writer's end: the same full disk again
+        self.stack.enter_context(contextlib.suppress(OSError))  # when the writer closes: the same full disk again
         self.summary_writer = self.stack.enter_context(SummaryWriter(self.directory))
         for table, rows in self.tables.items():
             self._write_rows(table, rows)
@@ -688,7 +688,7 @@ class Run:
                 writer.writeheader()
                 writer.writerows(rows)
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
-        for row in new:  # after the file: the run may go on in another process, which writes its own events
+        for row in new:  # after `_write`, which raises if another process continues this run
             for name, value in row.items():
                 if name != "step" and math.isfinite(value):
                     self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
@@ -743,7 +743,7 @@ class Run:
 
     def _in_pool(self, function, large, name, arguments):
         """Futures of `function(large, task, *arguments)` in the pool's workers, for each of these arguments."""
-        file = self.scratch / name  # a queue would hang at a dead worker with what is larger than a pipe
+        file = self.scratch / name  # sent through a queue, a large one would hang where a worker has died
         file.write_bytes(pickle.dumps(large))
         return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
 
@@ -795,7 +795,7 @@ class Run:
         title = f"{self.config.env_id}, seed {self.config.seed}"
         with or_warn("learning_curve.png", self.print):
             plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
-        if self.stopped or self.stopping:  # the latter: in the last evaluation, which is to be done yet
+        if self.stopped or self.stopping:  # the latter: the last evaluation was stopped and is still to do
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
         policy, films = copy.deepcopy(agent.policy).cpu().eval(), {}
         if self.config.video:
@@ -866,7 +866,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
 
 def plot_learning_curve(path, tables, title, reward_threshold=None):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
-    if "ipykernel" not in sys.modules:  # a command that a notebook started: the notebook's backend may be missing
+    if "ipykernel" not in sys.modules:  # in a notebook's `!command` its backend is set, but may be missing
         os.environ.pop("MPLBACKEND", None)
     from matplotlib.figure import Figure
 
