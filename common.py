@@ -343,7 +343,7 @@ class SeededEpisodes(gym.Wrapper):
 class Environments:
     """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on (SAC: (K, S)).
 
-    `num_episodes` (K,) counts the episodes that have ended in each.
+    `num_episodes` (K,) counts the episodes that have ended in each, `steps` the steps of all, over all processes.
     """
 
     def __init__(self, make_env, run, in_workers):
@@ -352,6 +352,7 @@ class Environments:
         new = {"episodes": [(0, [])] * num_envs, "finished": []}
         saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else new
         self.in_workers = in_workers
+        self.steps, self.steps_at_once = run.checkpoint.get("env_steps", 0), num_envs * run.ranks.world_size
         self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
 
         def make(i, episode, actions):
@@ -383,6 +384,7 @@ class Environments:
     def step_async(self, actions):
         """Takes actions (K, …). Workers begin the step at once; without them `step_wait` does it."""
         self.actions = actions
+        self.steps += self.steps_at_once
         if self.in_workers:
             self.vector.step_async(actions)
 
@@ -609,9 +611,10 @@ class Run:
     def start(self, agent, buffer, environments):
         """Restores the checkpoint, begins the files, saves a checkpoint for a new config, evaluates the random policy.
 
-        Returns the gradient updates and the environment steps done so far. The run writes nothing before this: by now
-        all that the user gave is known to be usable.
+        Returns the number of updates done so far. The run writes nothing before this: by now all that the user gave is
+        known to be usable.
         """
+        self.agent, self.buffer, self.environments = agent, buffer, environments
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
         if saved:
             own = saved["ranks"][self.ranks.rank]
@@ -636,12 +639,11 @@ class Run:
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
-        step, env_steps = self.saved_step, saved.get("env_steps", 0)
         if plain_config(config) != saved.get("config"):  # else a kill would lose the first steps, or a raised flag
-            self.save(step, env_steps, agent, buffer, environments)
-        self.evaluate(0, 0, policy=None)  # random actions, for comparison
-        self.last_logged = time.perf_counter(), step
-        return step, env_steps
+            self.save(self.saved_step)
+        self.evaluate(0, policy=None)  # random actions, for comparison
+        self.last_logged = time.perf_counter(), self.saved_step
+        return self.saved_step
 
     def _start_files(self):
         from torch.utils.tensorboard import SummaryWriter  # takes a second
@@ -669,9 +671,9 @@ class Run:
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
             self._save("best_policy.pt", "policy", {"weights": weights})
 
-    def _log(self, table, step, env_steps, values):
+    def _log(self, table, step, values):
         seconds = round(time.perf_counter() - self.started, 3)
-        self.tables[table].append({"step": step, "env_steps": env_steps, "seconds": seconds} | values)
+        self.tables[table].append({"step": step, "env_steps": self.environments.steps, "seconds": seconds} | values)
         self._write_rows(table, self.tables[table][-1:])
 
     def _write_rows(self, table, new):
@@ -693,7 +695,7 @@ class Run:
                 if name != "step" and math.isfinite(value):
                     self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
 
-    def log_training(self, step, env_steps, environments, metrics):
+    def log_training(self, step, metrics):
         """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
 
         Every `log_interval` updates. Raises RunError naming the step and the first metric that is not finite.
@@ -707,11 +709,11 @@ class Run:
                 raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
         now, (then, last_step) = time.perf_counter(), self.last_logged
         self.last_logged, speed = (now, step), (step - last_step) / (now - then)
-        self._log("train", step, env_steps, {"steps_per_second": speed} | environments.recent() | values)
+        self._log("train", step, {"steps_per_second": speed} | self.environments.recent() | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
         self.print(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
-    def evaluate(self, step, env_steps, policy):
+    def evaluate(self, step, policy):
         """Plays the evaluation episodes with `policy` (None: random actions) and logs them, unless this step is logged.
 
         The best policy so far is saved. A stop request ends this early; the resumed run does it again.
@@ -728,7 +730,7 @@ class Run:
         if self.stopping:
             return
         row, text = summarize([episode.result() for episode in episodes])
-        self._log(table, step, env_steps, row)
+        self._log(table, step, row)
         self.print(f"{f'step = {step}' if policy else 'random policy'}: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
@@ -750,20 +752,21 @@ class Run:
     def _film(self, parts, name, *more):
         return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], self.directory / name, *more)])[0]
 
-    def save(self, step, env_steps, agent, buffer, environments):
+    def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
-        self.saved_step = step
+        agent, buffer, self.saved_step = self.agent, self.buffer, step
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         random = {"cpu": torch.get_rng_state(), "cuda": cuda}
         replay = {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
-        own = {"buffer": replay, "environments": environments.state_dict(), "random": random}
+        own = {"buffer": replay, "environments": self.environments.state_dict(), "random": random}
         ranks = [own] * self.ranks.world_size if self.writes else None
         if self.ranks.world_size > 1:
             dist.gather_object(own, ranks)  # fills rank 0's list
         if not self.writes:
             return
         require_finite(agent, step)
-        state = {"step": step, "env_steps": env_steps, "seconds": time.perf_counter() - self.started, "ranks": ranks}
+        seconds, env_steps = time.perf_counter() - self.started, self.environments.steps
+        state = {"step": step, "env_steps": env_steps, "seconds": seconds, "ranks": ranks}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
         self._save("checkpoint.pt", "checkpoint", state | self.found)
@@ -780,15 +783,15 @@ class Run:
         except FileNotFoundError:
             raise RunError(f"another process continues the run in {self.path}, or it was removed") from None
 
-    def finish(self, step, env_steps, agent, buffer, environments, observation_space):
+    def finish(self, step, observation_space):
         """Saves and evaluates once more, draws the curve, exports and films the policy, and says where everything lies.
 
         A failure is a warning. After a stop it only saves, draws the curve and says how to continue.
         """
         if step > self.saved_step or self.stopped:
-            self.save(step, env_steps, agent, buffer, environments)
+            self.save(step)
         if not self.stopped:
-            self.evaluate(step, env_steps, agent.policy)
+            self.evaluate(step, self.agent.policy)
         if not self.writes:
             return
         self.progress.close()
@@ -797,7 +800,7 @@ class Run:
             plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
         if self.stopped or self.stopping:  # the latter: the last evaluation was stopped and is still to do
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
-        policy, films = copy.deepcopy(agent.policy).cpu().eval(), {}
+        policy, films = copy.deepcopy(self.agent.policy).cpu().eval(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
             learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]

@@ -451,38 +451,36 @@ def train(config):
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
         update = cuda_graph(agent) if config.cuda_graph else agent.update
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
-        step, env_steps = run.start(agent, buffer, envs)  # updates and environment steps: 0, or the checkpoint's
+        step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
         # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
-        while env_steps < config.initial_collect_steps and not run.stop_requested(step):
+        while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())
-            env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= config.initial_collect_steps:
+            if envs.steps >= config.initial_collect_steps:
                 agent.fit_reward_scale(buffer.rewards())
         while step < config.num_iterations and not run.stopped:  # stop_requested sets run.stopped
             if step % config.eval_interval == 0:
-                run.evaluate(step, env_steps, agent.policy)
+                run.evaluate(step, agent.policy)
             if run.stop_requested(step):
                 break
 
             # The next update needs `due` steps in all. A turn of this loop steps all environments, updates, or both.
             # The physics runs beside the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
-            collecting = env_steps < due
+            collecting = envs.steps < due
             if collecting:
                 deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
                 envs.step_async(agent.act(envs.observations, deterministic))
-                env_steps += config.num_envs * run.ranks.world_size
-            if env_steps >= due:
+            if envs.steps >= due:
                 metrics = update(buffer.sample(batch_size))
                 step += 1
-                run.log_training(step, env_steps, envs, metrics)  # a row every log_interval updates
+                run.log_training(step, metrics)  # a row every log_interval updates
             if collecting:
                 buffer.add(*envs.step_wait())  # the step that ran beside the update
             if step - run.saved_step >= config.checkpoint_interval:
-                run.save(step, env_steps, agent, buffer, envs)
+                run.save(step)
 
-        run.finish(step, env_steps, agent, buffer, envs, observation_space)  # checkpoint, evaluation, curve, films
+        run.finish(step, observation_space)  # checkpoint, evaluation, curve, films
         return run.path
 
 

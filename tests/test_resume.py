@@ -226,11 +226,11 @@ def hang_up_in_an_evaluation(module, step):
     """As a terminal that is closed. Most of the episodes still wait for a worker."""
     evaluate = common.Run.evaluate
 
-    def evaluate_slowly(run, at, env_steps, policy):
+    def evaluate_slowly(run, at, policy):
         if at == step:
             run.evaluate_episode, common.evaluation_seeds = play_for_ever, lambda config: range(20)
             threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGHUP)).start()
-        return evaluate(run, at, env_steps, policy)
+        return evaluate(run, at, policy)
 
     common.Run.evaluate = evaluate_slowly
 
