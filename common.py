@@ -49,6 +49,10 @@ FILE_FORMAT = 3  # of checkpoints and policies
 # Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+if hasattr(os, "register_at_fork"):  # a new process would forget a signal that comes before its Python runs
+    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, STOP_SIGNALS)
+    unblock = partial(signal.pthread_sigmask, signal.SIG_UNBLOCK, STOP_SIGNALS)
+    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=unblock)
 MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads", "cuda_graph"}
 
 

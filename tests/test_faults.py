@@ -291,6 +291,17 @@ def test_a_run_that_cannot_start_leaves_the_process_as_it_was(monkeypatch):
         pass
 
 
+def test_a_process_that_a_task_forks_can_be_ended_at_once():
+    """A signal that comes before its Python runs is not lost."""
+    with new_run():
+        for _ in range(20):
+            process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+            process.start()
+            process.terminate()
+            process.join(10)
+            assert process.exitcode == 128 + signal.SIGTERM
+
+
 @pytest.mark.parametrize(
     "error, status", [(common.InputError("bad"), 2), (common.RunError("bad"), 1), (KeyboardInterrupt(), 130)]
 )
