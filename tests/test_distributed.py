@@ -92,9 +92,9 @@ def save_agents(module, directory):
     """Saves each rank's agent, as it is at the end."""
     finish = common.Run.finish
 
-    def save_and_finish(run, step, env_steps, agent, *more):
-        torch.save(agent.state_dict(), f"{directory}/{run.ranks.rank}.pt")
-        finish(run, step, env_steps, agent, *more)
+    def save_and_finish(run, *arguments):
+        torch.save(run.agent.state_dict(), f"{directory}/{run.ranks.rank}.pt")
+        finish(run, *arguments)
 
     common.Run.finish = save_and_finish
 
