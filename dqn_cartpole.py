@@ -93,7 +93,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# Shapes: B batch, K environments, N stored, O numbers of an observation, A actions
+# In shapes: B batch, K environments, N transitions stored, O numbers of an observation, A number of actions
 
 
 class ObservationScaling(nn.Module):
@@ -108,10 +108,10 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds 200 times as wide as the observations (N, O), which would become nearly 0. CartPole has none."""
+        """Drops bounds beyond 200 times the observations (N, O): scaled, these would be nearly 0. CartPole has none."""
         largest = observations.abs().amax(0)
         ranks.average([largest])  # in place, over the processes
-        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # 1 where all were 0: black pixels
+        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # always 0 (a black pixel) counts as 1
         self.center[beyond], self.half_range[beyond] = 0.0, 1.0
 
     def forward(self, observation):
@@ -165,8 +165,8 @@ class Policy(nn.Module):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
-    the episode could go on, so its last state has a value: only `terminated` marks an end. A checkpoint has the rows.
+    A row is (observation, action, reward, terminated, next observation), so that sampling is one indexing operation.
+    A time limit does not set `terminated`: there the target still bootstraps from the next state.
     """
 
     def __init__(self, capacity, observation_size, device):
@@ -190,7 +190,7 @@ class ReplayBuffer:
         return observations, actions.squeeze(1).long(), rewards.squeeze(1), terminated.squeeze(1), next_observations
 
     def observations_and_rewards(self):
-        """All that are stored: (N, O), (N,)."""
+        """All stored observations (N, O) and rewards (N,)."""
         observations, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return observations, rewards.squeeze(1)
 
@@ -238,7 +238,7 @@ class DQNAgent(nn.Module):
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
         if self.config.value_unit:
-            self.ranks.average([mean := rewards.mean(), mean_abs := rewards.abs().mean()])
+            self.ranks.average([mean := rewards.mean(), mean_abs := rewards.abs().mean()])  # in place
             self.value_offset.copy_(mean / (1 - self.config.gamma))
             self.value_scale.copy_(torch.where(mean_abs > 0, mean_abs, 1.0) / (1 - self.config.gamma))
 

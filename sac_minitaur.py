@@ -95,7 +95,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# Shapes: B batch, K environments, N stored, O numbers observed, S these and the privileged ones, A numbers of an action
+# In shapes: B batch, K environments, N transitions stored, O observation, S the same with privileged numbers, A action
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -127,13 +127,13 @@ class Actor(nn.Module):
     def forward(self, observation):
         """Mean and log standard deviation before squashing, (…, A) each, for observations (…, O or more)."""
         mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
-        return mean, log_std.clamp(-20, 2)
+        return mean, log_std.clamp(-20, 2)  # ours, also with --tutorial: the bounds in the authors' code
 
     def sample(self, observation):
         """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
 
-        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). Each summand
-        equals 2 (log 2 − u − softplus(−2u)) exactly, and does not round to log 0 where tanh saturates.
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The code computes
+        log(1 − tanh²u) as 2 (log 2 − u − softplus(−2u)), which is equal, but finite where tanh u rounds to ±1.
         """
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
@@ -196,8 +196,8 @@ def require_finite(actions):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
-    One row (observation, action, reward, terminated, next observation) makes sampling one indexing. At a time limit
-    the episode could go on, so its last state has a value: only `terminated` marks an end. A checkpoint has the rows.
+    A row is (observation, action, reward, terminated, next observation), so that sampling is one indexing operation.
+    A time limit does not set `terminated`: there the target still bootstraps from the next state.
     """
 
     def __init__(self, capacity, state_size, action_size, device):
@@ -222,7 +222,7 @@ class ReplayBuffer:
         return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
 
     def rewards(self):
-        """All that are stored: (N,)."""
+        """All stored rewards: (N,)."""
         _, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
         return rewards.squeeze(1)
 
@@ -388,12 +388,12 @@ def cuda_graph(agent):
     def update(batch):
         nonlocal calls, recorded, metrics
         calls += 1
-        if calls < 3:  # makes Adam's state, which must not be recorded
+        if calls < 3:  # they make Adam's state and load what CUDA needs, which must not be recorded
             return agent.update(batch)
         if calls == 3:
             groups = [group for optimizer in agent.optimizers for group in optimizer.param_groups]
             for group in groups:
-                group["capturable"] = True
+                group["capturable"] = True  # PyTorch refuses to record an Adam step without it
             with torch.cuda.graph(graph):
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
@@ -422,7 +422,7 @@ def evaluate(policy, task, seed):
 def make_training_env(task, privileged):
     """The task with actions in [-1, 1], as the agent sees it in training.
 
-    With `privileged` the observations (O,) end with what only the critics see, (S − O,), where the environment has it.
+    With `privileged`, what only the critics see, (S − O,), follows the observation (O,), if the environment has it.
     """
     env = gym.make(task)
     low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
@@ -544,14 +544,14 @@ class MinitaurBulletEnv(gym.Env):
     MOTOR_LINKS = (1, 4, 7, 10, 14, 17, 20, 23)
     FOOT_LINKS = (3, 6, 9, 12, 16, 19, 22, 25)
     KNEE_ANGLE = -2.1834  # rad, in the start pose
-    KP, KD = 1.0, 0.02  # PWM duty per rad and per rad/s
+    KP, KD = 1.0, 0.02  # PD gains: share of the battery's voltage per rad and per rad/s
     RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0  # Ω, N·m/A, V
     MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7  # V, N·m
     # Motor torque in N·m at currents of 0, 10, … 60 A: the iron saturates.
     CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])
     TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])
-    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500  # N·m; after more substeps in a row above it a motor stays off
-    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13  # cosine of the base's tilt, m
+    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500  # N·m; a motor above it for more substeps in a row stays off
+    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13  # cosine of the base's tilt; m. Below either, the robot has fallen
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
@@ -639,7 +639,7 @@ class MinitaurBulletEnv(gym.Env):
         """
         swing, extension = np.repeat(action[:4], 2), np.repeat(action[4:], 2)
         quarter = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)
-        return math.pi + -math.pi / 4 * (extension + 1.5) + quarter * swing
+        return math.pi + -math.pi / 4 * (extension + 1.5) + quarter * swing  # 1.5: pybullet's offset_for_singularity
 
     def _substep(self, command):
         """Drives the motors towards the angles `command` for 0.002 s, in the order of pybullet's motor.py."""
