@@ -49,10 +49,6 @@ FILE_FORMAT = 3  # of checkpoints and policies
 # Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-if hasattr(os, "register_at_fork"):  # a new process would forget a signal that comes before its Python runs
-    block = partial(signal.pthread_sigmask, signal.SIG_BLOCK, STOP_SIGNALS)
-    unblock = partial(signal.pthread_sigmask, signal.SIG_UNBLOCK, STOP_SIGNALS)
-    os.register_at_fork(before=block, after_in_parent=unblock, after_in_child=unblock)
 MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads", "cuda_graph"}
 
 
@@ -272,12 +268,18 @@ def telling_task_errors(who="the task"):
         raise TaskError(f"{who} failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
-def handle_in(process, act, number, frame):
-    """Handles a signal by `act` in this process only. What a task forks ignores Ctrl-C, and other signals end it."""
-    if os.getpid() == process:
-        act(number, frame)
-    elif number != signal.SIGINT:
-        os._exit(128 + number)
+def around_fork(moment):
+    """What a task forks ignores Ctrl-C, and other signals end it. They wait until its Python runs, or would be lost."""
+    ours = [number for number in STOP_SIGNALS if getattr(signal.getsignal(number), "__module__", None) == __name__]
+    if moment == "after_in_child":
+        for number in ours:
+            signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_BLOCK if moment == "before" else signal.SIG_UNBLOCK, ours)
+
+
+for moment in ("before", "after_in_parent", "after_in_child"):
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(**{moment: partial(around_fork, moment)})
 
 
 def start_worker(task=None):
@@ -289,10 +291,9 @@ def start_worker(task=None):
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: forked, all workers would draw the same
     torch.seed()
-    ignore = partial(handle_in, os.getpid(), lambda *_: None)
     for number in STOP_SIGNALS:
         # A program that the task starts ignores Ctrl-C, too. Other signals end it: handlers are not inherited.
-        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else ignore)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else lambda *_: None)
     threading.Thread(target=lambda: (multiprocessing.parent_process().join(), os._exit(1)), daemon=True).start()
 
 
@@ -377,6 +378,7 @@ class Environments:
         if here:
             signal.signal(signal.SIGINT, handler)
         for process in getattr(self.vector, "processes", []):
+            run.stack.callback(process.join)  # or a zombie would stay
             run.stack.callback(process.kill)  # after `close`, also where Ctrl-C ends that
         run.stack.callback(self.close)
         (self.observation_size,) = self.vector.single_observation_space.shape
@@ -558,8 +560,7 @@ class Run:
             if threading.current_thread() is threading.main_thread():
                 for number in STOP_SIGNALS:
                     if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup ignores SIGHUP
-                        handler = partial(handle_in, os.getpid(), self._request_stop)
-                        self.stack.callback(signal.signal, number, signal.signal(number, handler))
+                        self.stack.callback(signal.signal, number, signal.signal(number, self._request_stop))
             if self.writes:
                 cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
                 size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows

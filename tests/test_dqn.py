@@ -192,8 +192,10 @@ def test_updates_on_the_gpu_are_those_of_the_cpu():
 def test_ratio_holds_with_several_environments(tmp_path):
     """On a task of three actions and six observations, whose rewards are costs."""
     choices = dict(env_id="Acrobot-v1", num_envs=3, collect_steps_per_iteration=2, run_dir=tmp_path / "run")
-    state = checkpoint(dqn_cartpole.train(dataclasses.replace(TINY, **choices)))
+    state = checkpoint(path := dqn_cartpole.train(dataclasses.replace(TINY, **choices)))
     assert state["step"] == 60 and 50 + 2 * 60 <= state["env_steps"] < 50 + 2 * 60 + 3
+    for row in read_csv(path / "eval.csv"):  # each step costs 1, but for the one that reaches the goal
+        assert row["average_return"] == pytest.approx(-row["average_episode_length"], abs=1)
     own = state["ranks"][0]
     assert len(own["environments"]["episodes"]) == 3 and len(own["buffer"]["rows"]) == state["env_steps"]
     assert state["agent"]["value_offset"] == pytest.approx(-100) and state["agent"]["value_scale"] == pytest.approx(100)

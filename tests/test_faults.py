@@ -299,7 +299,8 @@ def test_a_process_that_a_task_forks_can_be_ended_at_once():
             process.start()
             process.terminate()
             process.join(10)
-            assert process.exitcode == 128 + signal.SIGTERM
+            assert process.exitcode == -signal.SIGTERM
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.parametrize(

@@ -485,6 +485,8 @@ def test_train_stores_the_true_last_observation(tmp_path, env_id, num_envs):
     assert checkpoint(path)["ranks"][0]["environments"]["finished"] == 10 * [(10.0, 4)]
     row = read_csv(path / "train.csv")[-1]
     assert (row["collect_return"], row["collect_episode_length"]) == (10, 4)
+    evaluations = read_csv(path / "eval.csv")
+    assert {(row["average_return"], row["average_episode_length"]) for row in evaluations} == {(10, 4)}
 
 
 def test_critics_alone_learn_from_what_the_environment_tells_besides(tmp_path):
