@@ -624,7 +624,7 @@ class MinitaurBulletEnv(gym.Env):
             self._substep(command)
         observation = self._observation()
         x, _, height = self.position
-        energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS
+        energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS  # of one substep: pybullet's
         reward = x - self.x - 0.005 * energy
         self.x = x
         up_z = self.simulator.getMatrixFromQuaternion(self.orientation)[8]
