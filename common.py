@@ -377,9 +377,6 @@ class Environments:
         self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         if here:
             signal.signal(signal.SIGINT, handler)
-        for process in getattr(self.vector, "processes", []):
-            run.stack.callback(process.join)  # or a zombie would stay
-            run.stack.callback(process.kill)  # after `close`, also where Ctrl-C ends that
         run.stack.callback(self.close)
         (self.observation_size,) = self.vector.single_observation_space.shape
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
@@ -425,9 +422,15 @@ class Environments:
             with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
         deadline = time.perf_counter() + 10  # for all together: a simulator may take seconds to end
-        for process in getattr(self.vector, "processes", []):
-            process.join(max(0, deadline - time.perf_counter()))
-            self.vector.closed = True
+        processes = getattr(self.vector, "processes", [])
+        try:
+            for process in processes:
+                process.join(max(0, deadline - time.perf_counter()))
+        finally:  # also where Ctrl-C ends the wait
+            for process in processes:
+                process.kill()
+                process.join()
+                self.vector.closed = True
         self.vector.close()
 
 
