@@ -165,6 +165,14 @@ def kill_rank_1(module):
         before_update(module, 130, die)
 
 
+def test_two_processes_solve_cartpole(tmp_path):
+    """By 5 000, as each of the ten seeds that README reports does with one process."""
+    arguments = ["--device", "cpu", "--no-video", "--num-iterations", 5000, "--run-dir", tmp_path / "run"]
+    end(start_ranks(2, "dqn_cartpole", arguments, tmp_path / "output"))
+    header, *evaluations = rows(tmp_path / "run" / "eval.csv")
+    assert max(float(row[header.index("average_return")]) for row in evaluations) >= 195
+
+
 def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
     for gpus, device in ((0, "cpu"), (2, "cuda:1")):
         monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)

@@ -78,9 +78,12 @@ def change(path, **values):
 DAMAGES = {
     "truncated": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
     "a flipped bit": flip_a_byte,
+    "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("a shopping list\n"),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"format": 1})),
     "another archive": lambda path: path.write_bytes(saved({"weights": torch.zeros(3)})),
     "a list": lambda path: path.write_bytes(saved([1, 2])),
+    "another script's": partial(change, script="td3_ant"),
     "another format": partial(change, format=0),
     "another kind": partial(change, kind="video"),
     "missing": Path.unlink,
@@ -427,12 +430,16 @@ def have_no_streams_and_stop(module):
 
 
 def test_the_command_from_a_shell(script):
-    """In a new interpreter, before a console that cannot show an α. A refusal has status 2 and names no address."""
+    """In a new interpreter, before consoles that lack letters. A refusal has status 2 and names no address."""
     command = [sys.executable, ROOT / f"{script}.py"]
-    environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "cp1252"}
-    result = subprocess.run([*command, "--help"], env=environ, capture_output=True)
-    assert result.returncode == 0 and not result.stderr, result.stderr
-    assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
+    for encoding in ("cp1252", "cp437"):
+        environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
+        result = subprocess.run([*command, "--help"], env=environ, capture_output=True)
+        assert result.returncode == 0 and not result.stderr, result.stderr
+        assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
+    result = subprocess.run([*command, "--env-id", "NoSuchTask-v0"], capture_output=True, text=True)
+    assert result.returncode == 2 and not result.stdout
+    assert result.stderr.startswith("error: --env-id NoSuchTask-v0") and result.stderr.count("\n") == 1
     result = subprocess.run([*command, "--gamma", "2"], capture_output=True, text=True)
     assert result.returncode == 2 and not result.stdout
     assert "less than or equal to 1" in result.stderr and "https" not in result.stderr

@@ -158,12 +158,14 @@ def test_actions_never_leave_the_bounds(dtype, scale, register):
     assert np.array_equal(space.low, low)
     policy.load_state_dict(policy.state_dict() | {"low": torch.from_numpy(low.astype(np.float32))})
     env = sac_minitaur.make_training_env(gym.spec(register(low=low, high=high, dtype=dtype)), False)
+    env.reset()
     for sign in (-1, 1, 0.999, -1e-3):
         with torch.no_grad():
             policy.actor.net[0].weight.zero_()
             policy.actor.net[0].bias.fill_(np.arctanh(sign) if abs(sign) < 1 else 100 * sign)
         acted, forward = policy.act(np.zeros(1)), policy(torch.zeros(2, 1))[1].detach().numpy()
         received = env.action(np.full(300, sign, np.float32))  # what its step gives to the task
+        env.step(np.full(300, sign, np.float32))  # which looks whether it is in its space
         assert acted in space and received in space
         assert (policy.low.numpy() <= forward).all() and (forward <= policy.high.numpy()).all()
         exact = low.astype(float) + (high.astype(float) - low) * (1 + sign) / 2
@@ -228,11 +230,13 @@ def test_a_task_that_draws_from_a_librarys_own_generator_draws_anew_in_every_wor
 def test_a_task_that_returns_a_reward_that_is_not_finite(value, monkeypatch, tmp_path):
     step = Echo.step
     monkeypatch.setattr(Echo, "step", lambda *args: (step(*args)[0], value, False, False, {}))
-    with pytest.raises(common.TaskError, match=r"it returned the reward (nan|1e\+39) .*: not all finite"):
+    said = r"the task failed: it returned the reward (nan|1e\+39) .*: not all finite"
+    with pytest.raises(common.TaskError, match=said):
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-SHAPE, FINITE = "the task failed: it returned an observation of shape .* its space has ", "inf.*: not all finite"
+SHAPE = "the task failed: it returned an observation of shape .* its space has "
+FINITE = "the task failed: it returned the reward .*inf.*: not all finite"
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
@@ -402,10 +406,14 @@ def test_an_episode_that_cannot_be_played_again_on_resume(change, monkeypatch, t
     assert len(rows) == 40 + 40 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
 
 
+@pytest.mark.parametrize("env_id", [IDS["env_id"], "Pendulum-v1", "MinitaurBulletEnv-v0"])
 @pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
-def test_a_diverged_actor_ends_the_run_in_one_line(fault, tmp_path):
+def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
+    if env_id == "MinitaurBulletEnv-v0":
+        pytest.importorskip("pybullet")
+    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20} | fault
     with pytest.raises(common.RunError, match="the actor's actions are not finite") as caught:
-        train(tmp_path / "run", **SHORT | IDS | {"num_iterations": 200, "log_interval": 1000} | fault)
+        train(tmp_path / "run", **choices, env_id=env_id)
     assert len(str(caught.value).splitlines()) == 1
 
 
