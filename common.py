@@ -179,9 +179,8 @@ def derive_seed(*key):
 
 
 def evaluation_seeds(config):
-    """The seeds of the episodes that every evaluation of a run plays."""
-    no_environment = 2**32 - 1  # a number that no training environment has
-    return [derive_seed(config.seed, no_environment, i) for i in range(config.num_eval_episodes)]
+    """The seeds of the episodes that every evaluation plays. No training environment has the number 2**32 - 1."""
+    return [derive_seed(config.seed, 2**32 - 1, i) for i in range(config.num_eval_episodes)]
 
 
 class Ranks:
@@ -202,8 +201,7 @@ class Ranks:
             self.rank, self.world_size = dist.get_rank(), dist.get_world_size()
 
     def batch_share(self, config):
-        """The size of this process's share of a batch. Raises InputError when the shares are not equal, or when the
-        initial steps do not fill the batch."""
+        """This process's share of the batch size. Raises InputError for unequal shares or too few initial steps."""
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         own = min(config.initial_collect_steps // self.world_size, config.replay_buffer_capacity)
@@ -243,12 +241,11 @@ def find_task(config, action_space):
         os.chdir(here)  # a simulator may go to its own files
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
-    fits = isinstance(actions, action_space)
     if action_space is gym.spaces.Discrete:
-        needed, fits = "Discrete from 0", fits and actions.start == 0
+        needed, fits = "Discrete from 0", isinstance(actions, action_space) and actions.start == 0
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        fits = fits and actions.dtype in (np.float16, np.float32, np.float64)
+        fits = isinstance(actions, action_space) and actions.dtype in (np.float16, np.float32, np.float64)
         if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = actions.shape and widths.numel() and (widths.isfinite() & (widths > 0)).all()
@@ -283,10 +280,7 @@ for moment in ("before", "after_in_parent", "after_in_child"):
 
 
 def start_worker(task=None):
-    """Prepares a worker. It ends with the main process, to which it leaves the signals that all of them are sent.
-
-    `task` is what an evaluation's worker plays.
-    """
+    """Prepares a worker. It ends with the main process and leaves signals to it. Evaluations play `task` in it."""
     start_worker.task = task
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: forked, all workers would draw the same
@@ -300,9 +294,8 @@ def start_worker(task=None):
 class SeededEpisodes(gym.Wrapper):
     """Flat float32 observations of a task. Every episode has a seed of its own, and can be begun in its middle.
 
-    The seed comes from (seed, env index, episode number). No simulator can be saved in mid-episode. But an episode
-    follows from its seed and its actions: played again from the reset, it comes to the same state to the last bit.
-    Copies are kept: a task may change an array it was given or has returned.
+    No simulator can be saved in mid-episode. But an episode follows from its seed and its actions: played again from
+    the reset, it comes to the same state to the last bit. Arrays are copied: a task may change what it gave or got.
     """
 
     def __init__(self, env, key, episode, actions):
@@ -372,13 +365,11 @@ class Environments:
         kind = gym.vector.SyncVectorEnv
         if in_workers:  # no daemons, which could not start processes of their own
             kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
-        here = not in_workers and threading.current_thread() is threading.main_thread()
-        handler = here and signal.signal(signal.SIGINT, signal.SIG_IGN)  # what the task starts ignores Ctrl-C
-        self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
-        if here:
-            signal.signal(signal.SIGINT, handler)
-        run.stack.callback(self.close)
-        (self.observation_size,) = self.vector.single_observation_space.shape
+        with contextlib.ExitStack() as making:  # what the task starts in this process ignores Ctrl-C
+            if not in_workers and threading.current_thread() is threading.main_thread():
+                making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
+            self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
+        run.stack.callback(self._end_workers if in_workers else self.vector.close)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         self.num_episodes = np.array(self.vector.get_attr("episode"))
         if saved.get("fingerprint") not in (None, self._fingerprint()):
@@ -417,21 +408,19 @@ class Environments:
         """Tells where the running episodes stand: a checksum of their last observations and returns so far."""
         return zlib.crc32(np.array(self.vector.get_attr("total")), zlib.crc32(self.observations))
 
-    def close(self):
-        for pipe in getattr(self.vector, "parent_pipes", []):
+    def _end_workers(self):
+        for pipe in self.vector.parent_pipes:
             with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
         deadline = time.perf_counter() + 10  # for all together: a simulator may take seconds to end
-        processes = getattr(self.vector, "processes", [])
         try:
-            for process in processes:
+            for process in self.vector.processes:
                 process.join(max(0, deadline - time.perf_counter()))
         finally:  # also where Ctrl-C ends the wait
-            for process in processes:
+            self.vector.closed = True  # nothing is left for gymnasium to do
+            for process in self.vector.processes:
                 process.kill()
                 process.join()
-                self.vector.closed = True
-        self.vector.close()
 
 
 def write_atomically(path, write):
@@ -488,11 +477,10 @@ def _in_worker(function, file, *arguments):
 def say(line):
     """Prints a line, above the progress bar. A program whose output nobody reads any more goes on."""
     try:
-        if sys.stdout is not None:
-            tqdm.write(line)
-            sys.stdout.flush()
-    except ValueError:
-        pass  # the stream is closed
+        tqdm.write(line)
+        sys.stdout.flush()
+    except (AttributeError, ValueError):
+        pass  # there is no stream, or it is closed
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
@@ -525,8 +513,7 @@ class Run:
         if config.resume is not None:
             self.checkpoint = read_file(config.resume / "checkpoint.pt", "checkpoint", script)
             self._require_same_run(self.checkpoint["config"])
-        # To the microsecond, for runs that are started at once.
-        name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"
+        name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
         path = [config.resume or config.run_dir or Path("runs") / name]
         if self.ranks.world_size > 1:
             dist.broadcast_object_list(path)  # the others take rank 0's
@@ -619,8 +606,7 @@ class Run:
     def start(self, agent, buffer, environments):
         """Restores the checkpoint, begins the files, saves a checkpoint for a new config, evaluates the random policy.
 
-        Returns the number of updates done so far. The run writes nothing before this: by now all that the user gave is
-        known to be usable.
+        Returns the number of updates done. Nothing is written earlier: by now all that the user gave proved usable.
         """
         self.agent, self.buffer, self.environments = agent, buffer, environments
         config, saved, self.checkpoint = self.config, self.checkpoint, {}
@@ -730,8 +716,7 @@ class Run:
         if not self.writes or any(row["step"] == step for row in self.tables[table][-1:]):
             return
         policy = policy and copy.deepcopy(policy).cpu().eval()  # a fork may have dropout
-        seeds = [(seed,) for seed in evaluation_seeds(self.config)]
-        episodes = self._in_pool(self.evaluate_episode, policy, "policy", seeds)
+        episodes = self._in_pool(self.evaluate_episode, policy, "policy", evaluation_seeds(self.config))
         while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
             for episode in under_way.done:
                 episode.result()  # raises what went wrong
@@ -751,14 +736,14 @@ class Run:
                 self.found["best"] = row["average_return"], weights
                 self._save("best_policy.pt", "policy", {"weights": weights})
 
-    def _in_pool(self, function, large, name, arguments):
-        """Futures of `function(large, task, *arguments)` in the pool's workers, for each of these arguments."""
+    def _in_pool(self, function, large, name, seeds, *more):
+        """Futures of `function(large, task, seed, *more)` in the pool's workers, for each of the seeds."""
         file = self.scratch / name  # sent through a queue, a large one would hang where a worker has died
         file.write_bytes(pickle.dumps(large))
-        return [self.pool.submit(_in_worker, function, file, *each) for each in arguments]
+        return [self.pool.submit(_in_worker, function, file, seed, *more) for seed in seeds]
 
     def _film(self, parts, name, *more):
-        return self._in_pool(film, parts, name, [(evaluation_seeds(self.config)[0], self.directory / name, *more)])[0]
+        return self._in_pool(film, parts, name, evaluation_seeds(self.config)[:1], self.directory / name, *more)[0]
 
     def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
@@ -773,11 +758,10 @@ class Run:
         if not self.writes:
             return
         require_finite(agent, step)
-        seconds, env_steps = time.perf_counter() - self.started, self.environments.steps
-        state = {"step": step, "env_steps": env_steps, "seconds": seconds, "ranks": ranks}
+        state = {"step": step, "env_steps": self.environments.steps, "seconds": time.perf_counter() - self.started}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
-        self._save("checkpoint.pt", "checkpoint", state | self.found)
+        self._save("checkpoint.pt", "checkpoint", state | {"ranks": ranks} | self.found)
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
@@ -804,7 +788,7 @@ class Run:
             return
         self.progress.close()
         title = f"{self.config.env_id}, seed {self.config.seed}"
-        with or_warn("learning_curve.png", self.print):
+        with or_warn("learning_curve.png"):
             plot_learning_curve(self.directory / "learning_curve.png", self.tables, title, self.task.reward_threshold)
         if self.stopped or self.stopping:  # the latter: the last evaluation was stopped and is still to do
             return self.print(f"stopped at step {step}; {self._how_to_continue()}")
@@ -812,16 +796,16 @@ class Run:
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
             learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]
-            with or_warn("films", self.print):
+            with or_warn("films"):
                 films["learning.mp4"] = self._film(learning, "learning.mp4", 4, 25)
                 films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
                 films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
-        with or_warn("exported policy", self.print):
+        with or_warn("exported policy"):
             export_policy(self.directory / "policy.pt2", policy, observation_space.shape)
             policy.load_state_dict(self.found["best"][1])
             export_policy(self.directory / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
-            with or_warn(name, self.print):
+            with or_warn(name):
                 while futures.wait([recording], 0.1).not_done:
                     if self.stopping:
                         return self.print(f"stopped while filming; {self._how_to_continue()}")
@@ -831,7 +815,7 @@ class Run:
 
 
 @contextlib.contextmanager
-def or_warn(what, say):
+def or_warn(what):
     """Turns an exception into a printed warning."""
     try:
         yield
@@ -868,7 +852,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
     try:
         say(f"{config.evaluate}: {text}")
         if config.video:
-            with or_warn("video", say):
+            with or_warn("video"):
                 film([(policy, None, None)], task, seeds[0], video)
                 say(f"filmed one episode: {video}")
     except OSError as error:  # a full disk
@@ -907,7 +891,7 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
     A part is a policy (None: random actions), its weights (None: those that it has), and a caption or None.
     """
     import imageio
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
     if sys.platform == "linux" and "DISPLAY" not in os.environ:
@@ -916,8 +900,7 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
     def frame(caption):
         image = Image.fromarray(env.render())
         if caption:
-            font, outline = ImageFont.load_default(20), {"stroke_width": 2, "stroke_fill": "white"}
-            ImageDraw.Draw(image).text((8, 8), caption, "black", font, **outline)
+            ImageDraw.Draw(image).text((8, 8), caption, "black", font_size=20, stroke_width=2, stroke_fill="white")
         return np.asarray(image)
 
     def write(file):

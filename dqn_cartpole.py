@@ -127,14 +127,13 @@ class QNetwork(nn.Module):
 
     def __init__(self, observation_size, num_actions, hidden_layers):
         super().__init__()
-        layers, inputs = [], observation_size
-        for units in hidden_layers:
+        layers, sizes = [], (observation_size, *hidden_layers)
+        for inputs, units in zip(sizes, hidden_layers):
             layers += [linear := nn.Linear(inputs, units), nn.ReLU(inplace=True)]
             std = math.sqrt(2 / inputs) / 0.87962566103423978  # 0.88: the std of a normal cut at ±2 (as in Keras)
             nn.init.trunc_normal_(linear.weight, 0, std, -2 * std, 2 * std)
             nn.init.zeros_(linear.bias)
-            inputs = units
-        layers.append(linear := nn.Linear(inputs, num_actions))
+        layers.append(linear := nn.Linear(sizes[-1], num_actions))
         nn.init.uniform_(linear.weight, -0.03, 0.03)
         nn.init.constant_(linear.bias, -0.2)
         self.net = nn.Sequential(*layers)
@@ -218,9 +217,8 @@ class DQNAgent(nn.Module):
         self.policy = Policy(config, observation_space, action_space)
         self.scaling, self.q_network = self.policy.scaling, self.policy.q_network
         self.target_network = copy.deepcopy(self.q_network).requires_grad_(False)
-        # Q = offset + scale × output. With --value-unit `fit_scaling` sets these two.
-        self.register_buffer("value_offset", torch.tensor(0.0))
-        self.register_buffer("value_scale", torch.tensor(1.0))
+        self.register_buffer("value_offset", torch.tensor(0.0))  # Q = offset + scale × output
+        self.register_buffer("value_scale", torch.tensor(1.0))  # with --value-unit `fit_scaling` sets these two
         self.to(device)
         adam = {"eps": config.adam_epsilon, "fused": True}  # fused: one operation for all parameters
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), config.learning_rate, **adam)
@@ -309,7 +307,7 @@ def train(config):
         envs = common.Environments(partial(gym.make, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
-        buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observation_size, run.device)
+        buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observations.shape[1], run.device)
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
         # Random actions first. The scales are fitted to all of these steps, after the last.

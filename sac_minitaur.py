@@ -99,16 +99,12 @@ TUTORIAL = dict(
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
-    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization).
-
-    With `batch_norm` the input of each layer is normalized; momentum and ε are CrossQ's.
-    """
+    """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization)."""
     layers = []
-    for units in (*hidden_layers, outputs):
+    for size, units in zip((inputs, *hidden_layers), (*hidden_layers, outputs)):
         if batch_norm:
-            layers.append(nn.BatchNorm1d(inputs, momentum=0.01, eps=1e-3))
-        layers += [nn.Linear(inputs, units), nn.ReLU(inplace=True)]
-        inputs = units
+            layers.append(nn.BatchNorm1d(size, momentum=0.01, eps=1e-3))  # of each layer's input, with CrossQ's numbers
+        layers += [nn.Linear(size, units), nn.ReLU(inplace=True)]
     for layer in layers:
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -163,8 +159,7 @@ class Policy(nn.Module):
     def __init__(self, config, observation_space, action_space):
         super().__init__()
         self.action_space = action_space
-        sizes = math.prod(observation_space.shape), math.prod(action_space.shape)
-        self.actor = Actor(*sizes, config.actor_layers)
+        self.actor = Actor(math.prod(observation_space.shape), math.prod(action_space.shape), config.actor_layers)
         self.register_buffer("low", torch.tensor(action_space.low, dtype=torch.float32))  # a copy: loading writes to it
         self.register_buffer("high", torch.tensor(action_space.high, dtype=torch.float32))
 
@@ -270,17 +265,15 @@ class SACAgent(nn.Module):
         self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
         self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
-        # With batch normalization there are no target critics (CrossQ).
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(config.initial_log_alpha))
         self.to(device)
 
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
-        # One optimizer for the actor and α, which learn from the same sample of actions.
         actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
         alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
-        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)
+        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # both learn from the same actions
         self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
 
     def random_actions(self, count):
@@ -446,7 +439,7 @@ def train(config):
         batch_size = run.ranks.batch_share(config)
         envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
         torch.manual_seed(config.seed)  # the same networks on every rank
-        state_size = envs.observation_size  # S, with the privileged numbers
+        _, state_size = envs.observations.shape  # S, with the privileged numbers
         agent = SACAgent(config, observation_space, action_space, state_size, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
         update = cuda_graph(agent) if config.cuda_graph else agent.update
@@ -506,8 +499,7 @@ class Simulator:
     """
 
     def __init__(self):
-        # Imported here so that other tasks train on machines without pybullet.
-        import pybullet
+        import pybullet  # here, so that other tasks train on machines without it
         import pybullet_data
 
         self.pybullet = pybullet
@@ -547,9 +539,8 @@ class MinitaurBulletEnv(gym.Env):
     KP, KD = 1.0, 0.02  # PD gains: share of the battery's voltage per rad and per rad/s
     RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0  # Ω, N·m/A, V
     MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7  # V, N·m
-    # Motor torque in N·m at currents of 0, 10, … 60 A: the iron saturates.
-    CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])
-    TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])
+    CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])  # A
+    TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])  # N·m, a motor's at these currents: the iron saturates
     OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500  # N·m; a motor above it for more substeps in a row stays off
     MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13  # cosine of the base's tilt; m. Below either, the robot has fallen
 
@@ -660,9 +651,8 @@ class MinitaurBulletEnv(gym.Env):
         self._read_motors()
 
     def _read_motors(self):
-        states = self.simulator.getJointStates(self.robot, self.motor_joints)
-        self.angle = np.array([state[0] for state in states]) * self.DIRECTION
-        self.velocity = np.array([state[1] for state in states]) * self.DIRECTION
+        angle, velocity, _, _ = zip(*self.simulator.getJointStates(self.robot, self.motor_joints))
+        self.angle, self.velocity = np.array(angle) * self.DIRECTION, np.array(velocity) * self.DIRECTION
 
     def _observation(self):
         self.position, self.orientation = self.simulator.getBasePositionAndOrientation(self.robot)
