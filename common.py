@@ -613,10 +613,11 @@ class Run:
         if saved:
             own = saved["ranks"][self.ranks.rank]
             replay = own["buffer"]
-            buffer.size, buffer.position = len(replay["rows"]), replay["position"]
+            buffer.size, buffer.position = len(replay["rows"]), replay.pop("position")
             try:
                 agent.load_state_dict(saved["agent"])
-                buffer.rows[: buffer.size] = replay["rows"]
+                for name, stored in replay.items():
+                    getattr(buffer, name)[: buffer.size] = stored
             except RuntimeError:
                 raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
@@ -690,14 +691,15 @@ class Run:
                     self.summary_writer.add_scalar(f"{table}/{name}", value, row["step"])
 
     def log_training(self, step, metrics):
-        """Logs one update's `metrics`, scalar tensors, the recent episodes collected, and the speed since the last row.
+        """Logs one update's `metrics`, scalar tensors or numbers, recent episodes, and the speed since the last row.
 
         Every `log_interval` updates. Raises RunError naming the step and the first metric that is not finite.
         """
         self.progress.update()
         if not self.writes or step % self.config.log_interval:
             return
-        values = dict(zip(metrics, torch.stack(list(metrics.values())).tolist()))  # one wait for a GPU
+        values = [torch.as_tensor(value, dtype=torch.float32, device=self.device) for value in metrics.values()]
+        values = dict(zip(metrics, torch.stack(values).tolist()))  # one wait for a GPU
         for name, value in values.items():
             if not math.isfinite(value):
                 raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
@@ -750,7 +752,10 @@ class Run:
         agent, buffer, self.saved_step = self.agent, self.buffer, step
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         random = {"cpu": torch.get_rng_state(), "cuda": cuda}
-        replay = {"rows": buffer.rows[: buffer.size].to("cpu", copy=True), "position": buffer.position}
+        replay = {"position": buffer.position}
+        for name, value in vars(buffer).items():  # `rows`, and what a fork keeps beside it
+            if torch.is_tensor(value) and value.shape[:1] == buffer.rows.shape[:1]:
+                replay[name] = value[: buffer.size].to("cpu", copy=True)
         own = {"buffer": replay, "environments": self.environments.state_dict(), "random": random}
         ranks = [own] * self.ranks.world_size if self.writes else None
         if self.ranks.world_size > 1:
@@ -765,7 +770,15 @@ class Run:
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
-        self._write(name, partial(torch.save, state))
+
+        def write(file):
+            torch.save(state, file)
+            file.flush()
+            if foreign := torch.serialization.get_unsafe_globals_in_checkpoint(file.name):  # a fork's np.float64
+                what = f"{name} could not be read again: it has {min(foreign)}, not only tensors and Python's numbers"
+                raise RunError(f"{what}; the last good one is kept")
+
+        self._write(name, write)
 
     def _write(self, name, write):
         try:
