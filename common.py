@@ -241,11 +241,12 @@ def find_task(config, action_space):
         os.chdir(here)  # a simulator may go to its own files
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
+    fits = isinstance(actions, action_space)
     if action_space is gym.spaces.Discrete:
-        needed, fits = "Discrete from 0", isinstance(actions, action_space) and actions.start == 0
+        needed, fits = "Discrete from 0", fits and actions.start == 0
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        fits = isinstance(actions, action_space) and actions.dtype in (np.float16, np.float32, np.float64)
+        fits = fits and actions.dtype in (np.float16, np.float32, np.float64)
         if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = actions.shape and widths.numel() and (widths.isfinite() & (widths > 0)).all()
@@ -618,7 +619,7 @@ class Run:
                 agent.load_state_dict(saved["agent"])
                 for name, stored in replay.items():
                     getattr(buffer, name)[: buffer.size] = stored
-            except RuntimeError:
+            except (AttributeError, RuntimeError):  # the former for a tensor that the replay no longer has
                 raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
             for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
                 optimizer.load_state_dict(state)

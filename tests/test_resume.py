@@ -212,6 +212,9 @@ def test_what_a_fork_keeps(script, reference, tmp_path, monkeypatch):
     monkeypatch.setattr(agent, "update", with_numpys_learning_rate)
     with pytest.raises(common.RunError, match="^checkpoint.pt could not be read again: it has numpy"):
         module.train(module.Config(resume=run, num_iterations=80))
+    monkeypatch.setattr(buffer, "__init__", init)
+    with pytest.raises(common.InputError, match="does not fit"):
+        module.train(module.Config(resume=run, num_iterations=80))
     assert checkpoint(run)["step"] == 60
 
 
