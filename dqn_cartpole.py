@@ -57,7 +57,7 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target) per update
-    value_unit: bool = True  # ours (theirs: no): Q starts near the first steps' mean reward / (1 − γ): `fit_scaling`
+    value_unit: bool = True  # ours (theirs: no): Q = value of an endless episode + scale × output: `fit_scaling`
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
     observation_scaling: bool = True  # ours (theirs: no): map observations from the task's bounds to [-1, 1]
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -77,13 +77,13 @@ class Config:
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, given):
+    def _complete(cls, given):  # fills in what is not given
         return common.complete_config(given, cls, TUTORIAL, "dqn_cartpole")
 
     @model_validator(mode="after")
-    def _finite_worth(self):
+    def _finite_value(self):
         if self.value_unit and self.gamma == 1:
-            raise ValueError("--gamma 1 makes an endless episode's worth infinite: use less, or --no-value-unit")
+            raise ValueError("--gamma 1 makes an endless episode's value infinite: use less, or --no-value-unit")
         return self
 
 
@@ -108,7 +108,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds beyond 200 times the observations (N, O): scaled, these would be nearly 0. CartPole has none."""
+        """Drops bounds over 200 times the largest observation (N, O), which would come near 0. CartPole has none."""
         largest = observations.abs().amax(0)
         ranks.average([largest])  # in place, over the processes
         beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # always 0 (a black pixel) counts as 1
@@ -128,7 +128,7 @@ class QNetwork(nn.Module):
     def __init__(self, observation_size, num_actions, hidden_layers):
         super().__init__()
         layers, sizes = [], (observation_size, *hidden_layers)
-        for inputs, units in zip(sizes, hidden_layers):
+        for inputs, units in zip(sizes[:-1], hidden_layers):
             layers += [linear := nn.Linear(inputs, units), nn.ReLU(inplace=True)]
             std = math.sqrt(2 / inputs) / 0.87962566103423978  # 0.88: the std of a normal cut at ±2 (as in Keras)
             nn.init.trunc_normal_(linear.weight, 0, std, -2 * std, 2 * std)
@@ -152,7 +152,7 @@ class Policy(nn.Module):
         self.q_network = QNetwork(math.prod(observation_space.shape), int(action_space.n), config.layers)
 
     def forward(self, observation):
-        """Actions (batch,) for raw observations (batch, *observation shape)."""
+        """Actions (batch,) for raw observations (batch, …), flat or not."""
         return self.q_network(self.scaling(observation.flatten(1))).argmax(1)  # the largest output has the largest Q
 
     @torch.inference_mode()
@@ -165,7 +165,7 @@ class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
     A row is (observation, action, reward, terminated, next observation), so that sampling is one indexing operation.
-    A time limit does not set `terminated`: there the target still bootstraps from the next state.
+    A time limit does not set `terminated`: there the target still counts the next state's value.
     """
 
     def __init__(self, capacity, observation_size, device):
@@ -229,9 +229,9 @@ class DQNAgent(nn.Module):
         return torch.randint(self.num_actions, (count,)).numpy()
 
     def fit_scaling(self, observations, rewards):
-        """Fits the scales to the observations (N, O) and rewards (N,) of this rank, averaged over the ranks.
+        """Fits the scales to the observations (N, O) and rewards (N,), averaged over the processes.
 
-        An output of 0 then means the return of an endless episode. The network learns what an early end changes.
+        An output of 0 then means an endless episode, Q = mean reward / (1 − γ). The network learns what an end changes.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations, self.ranks)
@@ -282,7 +282,7 @@ class DQNAgent(nn.Module):
 
 
 def evaluate(policy, task, seed):
-    """Return and length of one episode with the greedy `policy`, or with random actions where it is None."""
+    """Return and length of one episode of `task`, a gymnasium spec. `policy` is greedy; None: random actions."""
     with gym.make(task) as env:
         env.action_space.seed(seed)
         observation, _ = env.reset(seed=seed)
@@ -302,15 +302,15 @@ def train(config):
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
-        batch_size = run.ranks.batch_share(config)
-        # The environments step here: a message to a worker takes longer than a step of CartPole.
+        batch_size = run.ranks.batch_share(config)  # this process's share
+        # The environments step here, in step_wait: a message to a worker takes longer than a step of CartPole.
         envs = common.Environments(partial(gym.make, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observations.shape[1], run.device)
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
-        # Random actions first. The scales are fitted to all of these steps, after the last.
+        # Random actions first. After the last, fit the scales: here, because a resumed run must not fit again.
         while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())

@@ -10,9 +10,9 @@
 The actor π samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
 earns much but stays random, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until the entropy
 has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as
-in dqn_cartpole.py. Actor and critics use the smaller of the two estimates of Q, because an actor that maximizes one
-estimate exploits its errors. In the paper slow copies of the critics, the target critics, compute y. By default batch
-normalization replaces them.
+in dqn_cartpole.py. The minimum is over the two critics, not over actions. The actor uses it, too: an actor that
+maximizes one estimate exploits its errors. In the paper slow copies of the critics, the target critics, compute y.
+By default batch normalization replaces them.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -49,7 +49,7 @@ class Config:
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
-    actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ below (theirs: 3e-4): Adam's, for the actor
+    actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
@@ -84,7 +84,7 @@ class Config:
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, given):
+    def _complete(cls, given):  # fills in what is not given
         return common.complete_config(given, cls, TUTORIAL, "sac_minitaur")
 
 
@@ -95,7 +95,7 @@ TUTORIAL = dict(
 )  # fmt: skip
 
 
-# In shapes: B batch, K environments, N transitions stored, O observation, S the same with privileged numbers, A action
+# In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -113,7 +113,7 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
 
 
 class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1). It sees the first O of S numbers: the critics see all."""
+    """A Gaussian over actions, squashed by tanh into (-1, 1). Of the S numbers that critics see it uses the first O."""
 
     def __init__(self, observation_size, action_size, hidden_layers):
         super().__init__()
@@ -192,7 +192,7 @@ class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
 
     A row is (observation, action, reward, terminated, next observation), so that sampling is one indexing operation.
-    A time limit does not set `terminated`: there the target still bootstraps from the next state.
+    A time limit does not set `terminated`: there the target still counts the next state's value.
     """
 
     def __init__(self, capacity, state_size, action_size, device):
@@ -243,7 +243,7 @@ def actor_loss(log_probs, q, alpha):
 def alpha_loss(log_alpha, log_probs, target_entropy):
     """−log α × (log π + target entropy), averaged: raises α while the entropy is below its target. log_probs (B,).
 
-    TF-Agents' default: equation 18 of arXiv:1812.05905 has α in place of log α, with the same sign of the gradient.
+    As in TF-Agents. Equation 18 of arXiv:1812.05905 has α where this has log α: the gradient's sign is the same.
     """
     return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
 
@@ -263,7 +263,7 @@ class SACAgent(nn.Module):
         self.target_entropy = config.target_entropy_per_action * action_size
         self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_reward_scale
         self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
-        self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)
+        self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)  # learns; policy.actor follows it
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
         self.log_alpha = nn.Parameter(torch.tensor(config.initial_log_alpha))
@@ -273,7 +273,7 @@ class SACAgent(nn.Module):
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
         alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
-        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # both learn from the same actions
+        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # `update` adds up their losses
         self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
 
     def random_actions(self, count):
@@ -281,7 +281,7 @@ class SACAgent(nn.Module):
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
     def fit_reward_scale(self, rewards):
-        """Divides the scale by the standard deviation of all ranks' rewards. Those of this rank are (N,)."""
+        """Divides the scale by the standard deviation of the rewards (N,), over all processes."""
         if self.config.reward_scaling:
             mean = rewards.mean()
             self.ranks.average([mean])  # in place, over the processes
@@ -312,7 +312,7 @@ class SACAgent(nn.Module):
         here would make the CPU wait for the GPU.
         """
         config = self.config
-        s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S)
+        s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S); the actor uses O of S
         rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
@@ -323,8 +323,8 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # Ours: one pass, as in CrossQ. Batch norm takes one mean and variance over (s, a) and (s', a'), because the
-            # new a' are distributed differently. No gradient reaches next_q, because y is computed under no_grad.
+            # Ours: one pass, as in CrossQ. The new a' are distributed differently from the stored a. So batch norm has
+            # one mean and variance over both. No gradient reaches next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
@@ -351,7 +351,7 @@ class SACAgent(nn.Module):
     def _descend(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # not the critics', through which the actor's loss passes
+        loss.backward(inputs=parameters)  # only these: the actor's loss passes through the critics
         # Several processes: the mean of their gradients, and of batch normalization's running statistics.
         statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]  # not the count of batches
         self.ranks.average([parameter.grad for parameter in parameters] + statistics)
@@ -359,12 +359,12 @@ class SACAgent(nn.Module):
 
 
 @torch.no_grad()
-def follow(average, module, tau):
-    """Moves the parameters of `average` by the fraction `tau` towards those of `module`, and copies its buffers."""
-    for mean, parameter in zip(average.parameters(), module.parameters()):
-        mean.lerp_(parameter, tau)
-    for mine, buffer in zip(average.buffers(), module.buffers()):
-        mine.copy_(buffer)  # the running statistics, where a fork's actor has batch normalization
+def follow(slow, module, tau):
+    """Moves the parameters of `slow` by the fraction `tau` towards those of `module`, and copies its buffers."""
+    for mine, parameter in zip(slow.parameters(), module.parameters()):
+        mine.lerp_(parameter, tau)
+    for mine, buffer in zip(slow.buffers(), module.buffers()):
+        mine.copy_(buffer)  # running statistics, if you give the actor batch normalization
 
 
 def cuda_graph(agent):
@@ -387,7 +387,7 @@ def cuda_graph(agent):
             groups = [group for optimizer in agent.optimizers for group in optimizer.param_groups]
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
-            with torch.cuda.graph(graph):
+            with torch.cuda.graph(graph):  # computes nothing: the replay below does
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
                 group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
@@ -400,7 +400,7 @@ def cuda_graph(agent):
 
 
 def evaluate(policy, task, seed):
-    """Return and length of one episode with the deterministic `policy`, or with random actions where it is None."""
+    """Return and length of one episode of `task`, a gymnasium spec, with `policy` (None: random actions)."""
     with gym.make(task) as env:
         env.action_space.seed(seed)
         observation, _ = env.reset(seed=seed)
@@ -436,7 +436,7 @@ def train(config):
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:
-        batch_size = run.ranks.batch_share(config)
+        batch_size = run.ranks.batch_share(config)  # this process's share
         envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
         torch.manual_seed(config.seed)  # the same networks on every rank
         _, state_size = envs.observations.shape  # S, with the privileged numbers
@@ -445,7 +445,7 @@ def train(config):
         update = cuda_graph(agent) if config.cuda_graph else agent.update
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
-        # Random actions first. The scale of the rewards is fitted to all of these steps, after the last.
+        # Random actions first. After the last, fit the reward scale: here, because a resumed run must not fit again.
         while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())
@@ -458,18 +458,18 @@ def train(config):
                 break
 
             # The next update needs `due` steps in all. A turn of this loop steps all environments, updates, or both.
-            # The physics runs beside the update, which learns from the steps before this one.
+            # The physics runs during the update, which learns from the steps before this one.
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = envs.steps < due
             if collecting:
                 deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
                 envs.step_async(agent.act(envs.observations, deterministic))
-            if envs.steps >= due:
+            if envs.steps >= due:  # step_async has counted the new steps
                 metrics = update(buffer.sample(batch_size))
                 step += 1
                 run.log_training(step, metrics)  # a row every log_interval updates
             if collecting:
-                buffer.add(*envs.step_wait())  # the step that ran beside the update
+                buffer.add(*envs.step_wait())  # the step that ran during the update
             if step - run.saved_step >= config.checkpoint_interval:
                 run.save(step)
 
@@ -548,7 +548,7 @@ class MinitaurBulletEnv(gym.Env):
         self.render_mode = render_mode
         self.simulator = Simulator()
         max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT
-        high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01
+        high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01  # a margin
         self.observation_space = gym.spaces.Box(np.float32(-high), np.float32(high))
         self.privileged_space = gym.spaces.Box(-np.inf, np.inf, (7,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (8,), np.float32)
@@ -562,7 +562,7 @@ class MinitaurBulletEnv(gym.Env):
         self.motor_enabled = np.ones(8, bool)
         self.x = 0.0
         self._read_motors()
-        for _ in range(100):  # stands for 0.2 s in the start pose
+        for _ in range(100):  # holds the start pose for 0.2 s
             self._substep(math.pi / 2)
         return self._observation(), {}
 
@@ -615,7 +615,7 @@ class MinitaurBulletEnv(gym.Env):
             self._substep(command)
         observation = self._observation()
         x, _, height = self.position
-        energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS  # of one substep: pybullet's
+        energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS  # one substep, as pybullet
         reward = x - self.x - 0.005 * energy
         self.x = x
         up_z = self.simulator.getMatrixFromQuaternion(self.orientation)[8]

@@ -136,7 +136,7 @@ def test_update_is_dqn(tutorial):
     old_target = [parameter.clone() for parameter in agent.target_network.parameters()]
     observations, actions, rewards, terminated, next_observations = batch = random_batch(64)
     agent.fit_scaling(observations, torch.tensor([-1.0, 3.0]))  # of mean 1 and mean size 2
-    offset, scale = (0, 1) if tutorial else (10, 20)  # divided by 1 − 0.9: an endless episode's worth
+    offset, scale = (0, 1) if tutorial else (10, 20)  # divided by 1 − 0.9: an endless episode's value
     assert (agent.value_offset.item(), agent.value_scale.item()) == pytest.approx((offset, scale))
     here, there = agent.scaling(observations), agent.scaling(next_observations)
     assert torch.equal(here, observations) == tutorial
