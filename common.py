@@ -13,7 +13,6 @@ import ctypes
 import dataclasses
 import errno
 import io
-import json
 import math
 import multiprocessing
 import os
@@ -42,7 +41,7 @@ import torch.distributed as dist
 import tyro
 from gymnasium.vector.utils import CloudpickleWrapper
 from pydantic import ConfigDict, Field
-from pydantic_core import ArgsKwargs, to_jsonable_python
+from pydantic_core import ArgsKwargs, to_json, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 3  # of checkpoints and policies
@@ -61,7 +60,7 @@ class RunError(Exception):
 
 
 class TaskError(Exception):
-    """The task's own code failed, perhaps in a worker. The message is its traceback."""
+    """The task's own code failed, perhaps in a worker. The message ends with its traceback."""
 
 
 def run_main(main):
@@ -96,7 +95,7 @@ CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=Tr
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:\d\d?)?)$")]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:[1-9]?\d)?)$")]
 Parallel = Annotated[int, Field(ge=1, le=1024)]  # environments, threads
 Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
@@ -107,13 +106,12 @@ def complete_config(given, config_class, tutorial, script):
     names = config_class.__dataclass_fields__.keys()
     values = dict(zip(names, given.args or ())) | (given.kwargs or {})
     rest = tutorial if values.get("tutorial") else {}
-    if names > values.keys():  # not for the command line, which gives all, completed before
-        if run := values.get("resume"):
-            rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
-            if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
-                raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
-        elif policy := values.get("evaluate"):  # it may lack a field that a fork added
-            rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
+    if run := values.get("resume"):
+        rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
+        if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
+            raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
+    elif policy := values.get("evaluate"):  # it may lack a field that a fork added
+        rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
     return ArgsKwargs((), rest | values)
 
 
@@ -158,14 +156,14 @@ def keep_freed_memory():
 
     Every update frees and allocates the same tensors. Without this each would be mapped in afresh, page by page.
     """
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # no glibc
+    with contextlib.suppress(OSError, AttributeError):  # no glibc
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(-3, 32 << 20)  # the most that glibc before 2.35 takes
         libc.mallopt(-1, 256 << 20)
 
 
 def empty_replay(capacity, columns, device):
-    """An uninitialized float32 tensor (capacity, columns). Raises InputError when there is not that much memory."""
+    """An uninitialized float32 tensor (capacity, columns). Raises InputError when that memory is refused."""
     try:
         return torch.empty(capacity, columns, device=device)
     except (RuntimeError, TypeError):  # the latter for a number beyond 64 bits
@@ -201,7 +199,7 @@ class Ranks:
             self.rank, self.world_size = dist.get_rank(), dist.get_world_size()
 
     def batch_share(self, config):
-        """This process's share of the batch size. Raises InputError for unequal shares or too few initial steps."""
+        """This process's share of the batch size. Raises InputError for unequal ones, or for more than is stored."""
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         own = min(config.initial_collect_steps // self.world_size, config.replay_buffer_capacity)
@@ -369,6 +367,7 @@ class Environments:
         with contextlib.ExitStack() as making:  # what the task starts in this process ignores Ctrl-C
             if not in_workers and threading.current_thread() is threading.main_thread():
                 making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
+            making.enter_context(run.killed_at_the_end() if in_workers else contextlib.nullcontext())
             self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self._end_workers if in_workers else self.vector.close)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
@@ -413,15 +412,10 @@ class Environments:
         for pipe in self.vector.parent_pipes:
             with contextlib.suppress(OSError, AttributeError):  # its worker has died
                 pipe.send(("close", None))  # the task may have to end what it has started
+        self.vector.closed = True  # nothing is left for gymnasium to do
         deadline = time.perf_counter() + 10  # for all together: a simulator may take seconds to end
-        try:
-            for process in self.vector.processes:
-                process.join(max(0, deadline - time.perf_counter()))
-        finally:  # also where Ctrl-C ends the wait
-            self.vector.closed = True  # nothing is left for gymnasium to do
-            for process in self.vector.processes:
-                process.kill()
-                process.join()
+        for process in self.vector.processes:
+            process.join(max(0, deadline - time.perf_counter()))
 
 
 def write_atomically(path, write):
@@ -557,16 +551,25 @@ class Run:
                 size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
                 context = multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
-                task, others = CloudpickleWrapper(self.task), multiprocessing.active_children()
+                task = CloudpickleWrapper(self.task)
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
-                list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
-                for worker in set(multiprocessing.active_children()).difference(others):
-                    self.stack.callback(worker.kill)
+                with self.killed_at_the_end():
+                    list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
             torch.set_num_threads(self.config.num_threads)
             failing.pop_all()
         return self
+
+    @contextlib.contextmanager
+    def killed_at_the_end(self):
+        """The worker processes that start inside end with the run, whatever they do."""
+        others = multiprocessing.active_children()
+        try:
+            yield
+        finally:
+            for worker in set(multiprocessing.active_children()).difference(others):
+                self.stack.callback(worker.kill)
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
@@ -635,7 +638,7 @@ class Run:
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
-        if plain_config(config) != saved.get("config"):  # else a kill would lose the first steps, or a raised flag
+        if plain_config(config) != saved.get("config"):  # so that a run killed early can go on, with a raised flag
             self.save(self.saved_step)
         self.evaluate(0, policy=None)  # random actions, for comparison
         self.last_logged = time.perf_counter(), self.saved_step
@@ -654,8 +657,8 @@ class Run:
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", error)
             raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
-        text = json.dumps(plain_config(self.config), indent=2) + "\n"
-        write_atomically(self.directory / "config.json", lambda file: file.write(text.encode()))
+        text = to_json(plain_config(self.config), indent=2)
+        write_atomically(self.directory / "config.json", lambda file: file.write(text))
         write_atomically(self.directory / ".owner", lambda file: file.write(self.owner))
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
             for path in self.directory.glob(name):
@@ -792,7 +795,7 @@ class Run:
     def finish(self, step, observation_space):
         """Saves and evaluates once more, draws the curve, exports and films the policy, and says where everything lies.
 
-        A failure is a warning. After a stop it only saves, draws the curve and says how to continue.
+        If curve, film or export fail it warns. After a stop it only saves, draws the curve and says how to continue.
         """
         if step > self.saved_step or self.stopped:
             self.save(step)

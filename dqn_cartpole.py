@@ -200,7 +200,7 @@ def td_targets(rewards, terminated, next_q, gamma):
 
 
 def gap_to_best(q, actions):
-    """max Q(s, ·) − Q(s, a), what the action costs: (B,), for q (B, A) and actions (B,). See arXiv:1512.04860."""
+    """max Q(s, ·) − Q(s, a), minus the advantage of a: (B,), for q (B, A) and actions (B,). See arXiv:1512.04860."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
 

@@ -331,24 +331,24 @@ class SACAgent(nn.Module):
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
         loss_q = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
-        self._descend(self.critic_optimizer, loss_q, self.critics.buffers())
+        self._gradient_step(self.critic_optimizer, loss_q, self.critics.buffers())
 
         # The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s). α falls while the entropy is above its target.
         # α is detached in the actor's loss, log π in α's. So one backward pass of the sum gives each its own gradient.
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-        self._descend(self.actor_optimizer, loss_pi + loss_alpha)
+        self._gradient_step(self.actor_optimizer, loss_pi + loss_alpha)
 
         # The policy's actor and the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
-        follow(self.policy.actor, self.actor, config.averaged_actor_tau)
+        soft_update(self.policy.actor, self.actor, config.averaged_actor_tau)
         if not config.critic_batch_norm:
-            follow(self.target_critics, self.critics, config.target_update_tau)
+            soft_update(self.target_critics, self.critics, config.target_update_tau)
         metrics = {"critic_loss": loss_q, "actor_loss": loss_pi, "alpha_loss": loss_alpha, "alpha": alpha}
         metrics |= {"entropy": -log_probs.mean(), "mean_q": q.mean()}
         return {name: value.detach() for name, value in metrics.items()}
 
-    def _descend(self, optimizer, loss, running_statistics=()):
+    def _gradient_step(self, optimizer, loss, running_statistics=()):
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         optimizer.zero_grad()
         loss.backward(inputs=parameters)  # only these: the actor's loss passes through the critics
@@ -359,12 +359,12 @@ class SACAgent(nn.Module):
 
 
 @torch.no_grad()
-def follow(slow, module, tau):
-    """Moves the parameters of `slow` by the fraction `tau` towards those of `module`, and copies its buffers."""
-    for mine, parameter in zip(slow.parameters(), module.parameters()):
-        mine.lerp_(parameter, tau)
-    for mine, buffer in zip(slow.buffers(), module.buffers()):
-        mine.copy_(buffer)  # running statistics, if you give the actor batch normalization
+def soft_update(target, source, tau):
+    """Moves the parameters of `target` by the fraction `tau` towards those of `source`, and copies its buffers."""
+    for slow, parameter in zip(target.parameters(), source.parameters()):
+        slow.lerp_(parameter, tau)
+    for slow, buffer in zip(target.buffers(), source.buffers()):
+        slow.copy_(buffer)  # running statistics, if you give the actor batch normalization
 
 
 def cuda_graph(agent):
@@ -387,7 +387,7 @@ def cuda_graph(agent):
             groups = [group for optimizer in agent.optimizers for group in optimizer.param_groups]
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
-            with torch.cuda.graph(graph):  # computes nothing: the replay below does
+            with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # computes nothing, replays do
                 recorded, metrics = batch, agent.update(batch)
             for group in groups:
                 group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph

@@ -534,6 +534,29 @@ def never_close(module):
     common.SeededEpisodes.close = lambda env: time.sleep(600 * hasattr(env, "total"))
 
 
+def test_a_second_interrupt_does_not_wait_for_a_task_that_is_being_made(tmp_path):
+    hook = partial(never_made, begun=tmp_path / "begun")
+    run = Process("sac_minitaur", flags("sac_minitaur", tmp_path / "run"), tmp_path / "output", hook)
+    wait_until((tmp_path / "begun").exists, 60)
+    run.kill(signal.SIGINT)
+    wait_until(lambda: "stopping" in run.stderr, 60)
+    run.kill(signal.SIGINT)
+    assert run.wait(9) == 130 and "Traceback" not in run.stderr
+
+
+def never_made(module, begun):
+    """In a worker: gymnasium makes one environment before."""
+    init = common.SeededEpisodes.__init__
+
+    def wait(env, *arguments):
+        if multiprocessing.parent_process():
+            begun.touch()
+            time.sleep(600)
+        init(env, *arguments)
+
+    common.SeededEpisodes.__init__ = wait
+
+
 def test_interrupted_evaluation_of_a_policy(script, copy, tmp_path):
     run = Process(script, ["--evaluate", copy / "policy.pt"], tmp_path / "output", partial(acting, action=interrupt))
     assert run.wait() == 130 and not run.stderr

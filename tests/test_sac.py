@@ -248,7 +248,7 @@ def test_a_forks_normalized_actor_is_evaluated_with_its_statistics():
     module = nn.Sequential(nn.BatchNorm1d(3), nn.Linear(3, 2))
     average = copy.deepcopy(module)
     module(torch.rand(8, 3))
-    sac_minitaur.follow(average, module, 0.5)
+    sac_minitaur.soft_update(average, module, 0.5)
     assert module[0].running_mean.all() and torch.equal(average[0].running_mean, module[0].running_mean)
 
 
