@@ -364,10 +364,10 @@ class Environments:
         kind = gym.vector.SyncVectorEnv
         if in_workers:  # no daemons, which could not start processes of their own
             kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
-        with contextlib.ExitStack() as making:  # what the task starts in this process ignores Ctrl-C
+        with run.killed_at_the_end(), contextlib.ExitStack() as making:
             if not in_workers and threading.current_thread() is threading.main_thread():
+                # What the task starts in this process ignores Ctrl-C.
                 making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
-            making.enter_context(run.killed_at_the_end() if in_workers else contextlib.nullcontext())
             self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self._end_workers if in_workers else self.vector.close)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
@@ -563,7 +563,7 @@ class Run:
 
     @contextlib.contextmanager
     def killed_at_the_end(self):
-        """The worker processes that start inside end with the run, whatever they do."""
+        """The processes that start inside end with the run, whatever they do."""
         others = multiprocessing.active_children()
         try:
             yield
@@ -748,8 +748,8 @@ class Run:
         file.write_bytes(pickle.dumps(large))
         return [self.pool.submit(_in_worker, function, file, seed, *more) for seed in seeds]
 
-    def _film(self, parts, name, *more):
-        return self._in_pool(film, parts, name, evaluation_seeds(self.config)[:1], self.directory / name, *more)[0]
+    def _film(self, clips, name, *more):
+        return self._in_pool(film, clips, name, evaluation_seeds(self.config)[:1], self.directory / name, *more)[0]
 
     def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises RunError, saving nothing, for bad weights."""
@@ -778,8 +778,8 @@ class Run:
         def write(file):
             torch.save(state, file)
             file.flush()
-            if foreign := torch.serialization.get_unsafe_globals_in_checkpoint(file.name):  # a fork's np.float64
-                what = f"{name} could not be read again: it has {min(foreign)}, not only tensors and Python's numbers"
+            if unsafe := torch.serialization.get_unsafe_globals_in_checkpoint(file.name):  # a fork's np.float64
+                what = f"{name} could not be read again: it has {min(unsafe)}, not only tensors and Python's numbers"
                 raise RunError(f"{what}; the last good one is kept")
 
         self._write(name, write)
@@ -850,10 +850,10 @@ def require_finite(module, step):
 def summarize(results):
     """The metrics of evaluation episodes, from a list of (return, length), and a line that tells them."""
     returns, lengths = np.array(results, np.float64).T.tolist()  # a checkpoint may not hold numpy's own numbers
-    mean, spread, length, length_spread = (float(f(x)) for x in (returns, lengths) for f in (np.mean, np.std))
-    row = {"average_return": mean, "std_return": spread, "min_return": min(returns), "max_return": max(returns)}
-    row |= {"average_episode_length": length, "std_episode_length": length_spread}
-    text = f"AverageReturn = {mean:.6f} +/- {spread:.6f}, AverageEpisodeLength = {length:.6f} +/- {length_spread:.6f}"
+    mean, std, length, length_std = (float(f(x)) for x in (returns, lengths) for f in (np.mean, np.std))
+    row = {"average_return": mean, "std_return": std, "min_return": min(returns), "max_return": max(returns)}
+    row |= {"average_episode_length": length, "std_episode_length": length_std}
+    text = f"AverageReturn = {mean:.6f} +/- {std:.6f}, AverageEpisodeLength = {length:.6f} +/- {length_std:.6f}"
     return row, text
 
 
@@ -902,10 +902,10 @@ def plot_learning_curve(path, tables, title, reward_threshold=None):
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
-def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
-    """Films the first `seconds` of an episode in real time, for each of `parts`, at most `max_fps` frames a second.
+def film(clips, task, seed, path, seconds=math.inf, max_fps=50):
+    """Films the first `seconds` of an episode in real time, for each of `clips`, at most `max_fps` frames a second.
 
-    A part is a policy (None: random actions), its weights (None: those that it has), and a caption or None.
+    A clip is a policy (None: random actions), its weights (None: those that it has), and a caption or None.
     """
     import imageio
     from PIL import Image, ImageDraw
@@ -925,7 +925,7 @@ def film(parts, task, seed, path, seconds=math.inf, max_fps=50):
         skip = math.ceil(rate / max_fps)
         options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
         with contextlib.closing(imageio.get_writer(file.name, **options)) as video:
-            for policy, weights, caption in parts:
+            for policy, weights, caption in clips:
                 if weights:
                     policy.load_state_dict(weights)
                 env.action_space.seed(seed)
