@@ -657,7 +657,7 @@ class Run:
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", error)
             raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
-        text = to_json(plain_config(self.config), indent=2)
+        text = to_json(plain_config(self.config), indent=2) + b"\n"
         write_atomically(self.directory / "config.json", lambda file: file.write(text))
         write_atomically(self.directory / ".owner", lambda file: file.write(self.owner))
         for name in ("events.out.tfevents.*", ".tmp-*", *(f"{table}.csv" for table in self.tables)):
@@ -876,7 +876,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
         raise RunError(first_line(error)) from None
 
 
-def plot_learning_curve(path, tables, title, reward_threshold=None):
+def plot_learning_curve(path, tables, title, reward_threshold):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
     if "ipykernel" not in sys.modules:  # in a notebook's `!command` its backend is set, but may be missing
         os.environ.pop("MPLBACKEND", None)
