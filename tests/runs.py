@@ -99,7 +99,7 @@ def read_command_line(script, *arguments):
         return common.read_command_line(importlib.import_module(script).Config, "")
 
 
-def wait_until(condition, seconds):
+def wait_until(condition, seconds=600):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"

@@ -6,12 +6,14 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 import torch
 
 import common
+import dqn_cartpole
 from runs import AGENTS, ROOT, SCRIPTS, Process, assert_same, assert_same_run, before_update, checkpoint, die, flags
 from runs import rows, session, start_ranks, wait_until
 
@@ -118,7 +120,7 @@ def test_all_ranks_stop_with_one_and_each_has_experience_of_its_own(script, tmp_
     """Of two processes, two environments each, the second alone is asked to stop."""
     more = ["--num-envs", 2, "--num-iterations", 10**6, "--replay-buffer-capacity", 10**6]
     ranks = start_ranks(2, script, flags(script, tmp_path / "run", *more), tmp_path / "output")
-    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    wait_until((tmp_path / "run" / "train.csv").exists)
     ranks[1].kill(signal.SIGTERM)
     end(ranks)
     assert f"torchrun --nproc-per-node 2 {script}.py --resume " in ranks[0].stdout
@@ -177,6 +179,10 @@ def test_each_process_takes_a_gpu_of_its_own(monkeypatch):
     for gpus, device in ((0, "cpu"), (2, "cuda:1")):
         monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
         assert common.select_device("auto", local_rank=1) == torch.device(device)
+    ranks = SimpleNamespace(rank=0, world_size=2, local_rank=0)
+    with monkeypatch.context() as two, pytest.raises(common.InputError, match="--device cuda:1: .*use --device cuda$"):
+        two.setattr(common, "Ranks", lambda: ranks)
+        common.Run(dqn_cartpole.Config(device="cuda:1"), "dqn_cartpole", None, None)
     for name, rank in (("auto", 2), ("cuda", 2), ("cuda:2", 0)):
         with pytest.raises(common.InputError, match="--device cuda:2 is not there.*2.*: use --device cpu"):
             common.select_device(name, rank)
@@ -196,13 +202,11 @@ def test_batches_that_two_processes_cannot_take(size, said, tmp_path):
 def test_torchrun_ends_when_a_rank_is_killed(tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [*torchrun, ROOT / "sac_minitaur.py", *flags("sac_minitaur", tmp_path / "run", "--num-iterations", 10**6)]
-    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_until((tmp_path / "run" / "train.csv").exists)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     ranks = [int(pid) for pid in children if b"\0RANK=" in Path(f"/proc/{pid}/environ").read_bytes()]
     os.kill(ranks[1], signal.SIGKILL)
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode != 0
-    assert "error: lost another process" in errors or "SIGKILL" in errors
+    assert process.wait(600) != 0
     wait_until(lambda: not any(map(session, ranks)), seconds=60)  # one session per rank
     assert len(checkpoint(tmp_path / "run")["ranks"]) == 2

@@ -1,9 +1,12 @@
 """DQN: its formulas by hand, its parts by what they promise, and that it learns."""
 
+import copy
 import dataclasses
 import math
+import re
 import subprocess
 import sys
+from concurrent import futures
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +17,7 @@ from pydantic import ValidationError
 import common
 import dqn_cartpole
 from dqn_cartpole import Config, DQNAgent, QNetwork, ReplayBuffer
-from runs import ROOT, checkpoint, read_command_line, read_csv
+from runs import ROOT, assert_same, checkpoint, load_policy, read_command_line, read_csv
 
 TINY = Config(
     num_iterations=60, initial_collect_steps=50, batch_size=16, replay_buffer_capacity=200, layers=(8, 6),
@@ -75,16 +78,27 @@ def test_initialization():
     assert 0.029 < last.weight.abs().max().item() <= 0.03
     assert last.weight.std().item() == pytest.approx(0.03 / math.sqrt(3), rel=0.1)
     assert (last.bias == -0.2).all()
-    assert Config().layers == (100, 50)  # the tutorial's
+
+
+def test_the_tutorials_values_are_the_defaults():
+    config = Config()
+    assert config.env_id == "CartPole-v0" and config.num_iterations == 20_000 and config.layers == (100, 50)
+    assert (config.initial_collect_steps, config.collect_steps_per_iteration, config.batch_size) == (100, 1, 64)
+    assert config.replay_buffer_capacity == 100_000 and config.learning_rate == 1e-3
+    assert config.epsilon == 0.1 and config.adam_epsilon == 1e-7
+    assert (config.log_interval, config.eval_interval, config.num_eval_episodes) == (200, 1_000, 10)
 
 
 def test_stored_next_observations_are_the_true_ones(tmp_path):
     """Every stored transition is a step of CartPole's physics, at the time limit too, where the reset comes after."""
-    path = dqn_cartpole.train(dataclasses.replace(TINY, max_episode_steps=7, run_dir=tmp_path / "run"))
+    still = {"learning_rate": 0.0, "epsilon": 0.0}  # so that the policy which acts is the last one
+    path = dqn_cartpole.train(dataclasses.replace(TINY, max_episode_steps=7, run_dir=tmp_path / "run", **still))
     rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
     assert len(rows) == 50 + 60 and rows.untyped_storage().nbytes() == rows.nbytes  # not those of the whole capacity
     rows = rows.double().numpy()
     observations, actions, rewards, terminated, next_observations = np.split(rows, [4, 5, 6, 7], axis=1)
+    greedy = load_policy(path / "policy.pt")(torch.from_numpy(observations).float())
+    assert actions[50:, 0].tolist() == greedy[50:].tolist() and 0 < actions[:50].sum() < 50  # random ones first
     assert (terminated == 0).all()  # a pole needs more than 7 steps to fall
     physics = gym.make("CartPole-v1").unwrapped
     physics.reset(seed=0)
@@ -191,14 +205,48 @@ def test_updates_on_the_gpu_are_those_of_the_cpu():
 
 def test_ratio_holds_with_several_environments(tmp_path):
     """On a task of three actions and six observations, whose rewards are costs."""
-    choices = dict(env_id="Acrobot-v1", num_envs=3, collect_steps_per_iteration=2, run_dir=tmp_path / "run")
-    state = checkpoint(path := dqn_cartpole.train(dataclasses.replace(TINY, **choices)))
+    choices = dict(env_id="Acrobot-v1", num_envs=3, collect_steps_per_iteration=2, learning_rate_decay=59)
+    state = checkpoint(path := dqn_cartpole.train(dataclasses.replace(TINY, **choices, run_dir=tmp_path / "run")))
+    assert state["optimizers"][0]["param_groups"][0]["lr"] == 0.0005  # half of it in update 59, the last from 0 on
     assert state["step"] == 60 and 50 + 2 * 60 <= state["env_steps"] < 50 + 2 * 60 + 3
     for row in read_csv(path / "eval.csv"):  # each step costs 1, but for the one that reaches the goal
         assert row["average_return"] == pytest.approx(-row["average_episode_length"], abs=1)
     own = state["ranks"][0]
     assert len(own["environments"]["episodes"]) == 3 and len(own["buffer"]["rows"]) == state["env_steps"]
     assert state["agent"]["value_offset"] == pytest.approx(-100) and state["agent"]["value_scale"] == pytest.approx(100)
+
+
+def test_a_diverged_policy_is_not_the_best(tmp_path):
+    choices = {"learning_rate": 1e39, "eval_interval": 1, "log_interval": 1000, "run_dir": tmp_path / "run"}
+    with pytest.raises(common.RunError, match="is not finite at step 1; the last good checkpoint is kept"):
+        dqn_cartpole.train(dataclasses.replace(TINY, **choices))
+    weights = load_policy(tmp_path / "run" / "best_policy.pt").state_dict().values()
+    assert all(tensor.isfinite().all() for tensor in weights)
+
+
+def test_what_a_terminal_shows(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    dqn_cartpole.train(dataclasses.replace(TINY, run_dir=tmp_path / "run"))
+    shown = capsys.readouterr()
+    assert "60/60" in shown.err and "return " in shown.err  # the progress bar
+    for line in (r"step = 60: loss = \S+, steps per second = \d+", r"step = 60: AverageReturn = .*"):
+        assert re.search(f"^{line}$", shown.out, re.MULTILINE), shown.out
+
+
+def test_what_is_filmed(monkeypatch, tmp_path):
+    """The trained agent, a random one, and five policies, closer to each other at the beginning."""
+    films, done = {}, futures.Future()
+    done.set_result(None)
+    record = lambda run, clips, name, *more: films.update({name: copy.deepcopy(clips)}) or done  # noqa: E731
+    monkeypatch.setattr(common.Run, "_film", record)
+    choices = {"eval_interval": 5, "video": True, "run_dir": tmp_path / "run"}
+    path = dqn_cartpole.train(dataclasses.replace(TINY, **choices))
+    captions = [caption.split(" updates: return ")[0] for _, _, caption in films["learning.mp4"]]
+    assert captions == ["0", "5", "15", "35", "60"]
+    ((trained, weights, _),) = films["trained_agent.mp4"]
+    assert weights is None
+    assert_same(trained.state_dict(), load_policy(path / "policy.pt").state_dict())
+    assert films["random_agent.mp4"] == [(None, None, None)]
 
 
 @pytest.mark.parametrize("seed", (0, 1))
@@ -223,7 +271,7 @@ def test_refuses_what_it_cannot_train_with(monkeypatch):
         ({"env_id": "Pendulum-v1"}, "Discrete"),
         ({"env_id": "FromOne-v0"}, "Discrete"),
         ({"batch_size": 51}, "--batch-size 51 is more than the 50"),
-        ({"replay_buffer_capacity": 10**12}, "44000.0 GB"),
+        ({"replay_buffer_capacity": 10**20}, "4400000000000.0 GB"),
     ):
         with pytest.raises(common.InputError, match=f"^[^\n]*{said}[^\n]*$"):
             dqn_cartpole.train(dataclasses.replace(TINY, **choices))

@@ -17,6 +17,7 @@ import threading
 import time
 import zipfile
 from functools import partial
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from unittest import mock
@@ -26,6 +27,7 @@ import imageio
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 import common
 import dqn_cartpole
@@ -34,7 +36,7 @@ from runs import finish, flags, interrupt, load_policy, read_command_line, read_
 
 
 def assert_one_line(run, status, *words):
-    assert run.wait(60) == status, (run.stdout, run.stderr)
+    assert run.wait() == status, (run.stdout, run.stderr)
     lines = run.stderr.strip().split("\n")
     assert len(lines) == 1 and lines[0].startswith("error: "), run.stderr
     assert all(word in lines[0] for word in words), lines[0]
@@ -249,11 +251,22 @@ def test_full_disk(script, small_disk, reference, tmp_path):
     assert_same_run(small_disk / "run", reference)
 
 
-def test_full_disk_from_the_start(script, small_disk, tmp_path):
+def test_full_disk_at_the_end(small_disk, tmp_path):
+    """Only what is written then is missing."""
+    hook = partial(before_export, action=partial(fill, small_disk / "other people's"))
+    run = finish("dqn_cartpole", flags("dqn_cartpole", small_disk / "run"), tmp_path / "output", hook)
+    assert "warning: no exported policy" in run.stdout and not run.stderr
+    assert checkpoint(small_disk / "run")["step"] == 300 and not list((small_disk / "run").glob("*.pt2"))
+
+
+def before_export(module, action):
+    before_call(common, "export_policy", 1, action)
+
+
+def test_full_disk_from_the_start(small_disk, tmp_path):
     fill(small_disk / "other people's")
-    run = Process(script, flags(script, small_disk / "run"), tmp_path / "output")
-    run.wait()
-    assert run.status and len(run.stderr.strip().split("\n")) == 1, run.stderr
+    run = Process("dqn_cartpole", flags("dqn_cartpole", small_disk / "run"), tmp_path / "output")
+    assert_one_line(run, 1, "No space left on device; there is no checkpoint yet")
 
 
 def test_files_are_whole_or_not_there(tmp_path):
@@ -304,9 +317,23 @@ def test_a_process_that_a_task_forks_can_be_ended_at_once():
             process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
             process.start()
             process.terminate()
-            process.join(10)
+            process.join()
             assert process.exitcode == -signal.SIGTERM
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_what_a_task_forks_and_does_not_end_ends_with_the_run():
+    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+
+    def make():
+        process.start()
+        return gym.make("CartPole-v1")
+
+    with new_run() as run:
+        common.Environments(make, run, in_workers=False)
+        assert process.is_alive()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(
@@ -340,11 +367,11 @@ def test_one_directory_for_two_runs_that_start_at_once(tmp_path):
 def test_a_run_that_is_continued_while_it_runs(script, tmp_path):
     """The older of the two processes stops. Each file is whole."""
     older = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "older")
-    wait_until((tmp_path / "run" / "eval.csv").exists, 60)
+    wait_until((tmp_path / "run" / "eval.csv").exists)
     newer = Process(script, ["--resume", tmp_path / "run"], tmp_path / "newer")
     assert_one_line(older, 1, f"another process continues the run in {tmp_path}/run, ")
     step = checkpoint(tmp_path / "run")["step"]
-    wait_until(lambda: checkpoint(tmp_path / "run")["step"] > step, 60)
+    wait_until(lambda: checkpoint(tmp_path / "run")["step"] > step)
     newer.kill(signal.SIGINT)
     assert newer.wait() == 0, newer.stderr
 
@@ -352,7 +379,7 @@ def test_a_run_that_is_continued_while_it_runs(script, tmp_path):
 def wait_for_the_other(module, path):
     def wait():
         (path / str(os.getpid())).touch()
-        wait_until(lambda: len(list(path.iterdir())) == 2, 60)
+        wait_until(lambda: len(list(path.iterdir())) == 2)
 
     before_call(common.Run, "_start_files", 1, wait)
 
@@ -433,13 +460,12 @@ def have_no_streams_and_stop(module):
 
 
 def test_the_command_from_a_shell(script):
-    """In a new interpreter, before consoles that lack letters. A refusal has status 2 and names no address."""
+    """In a new interpreter, before a console that lacks letters. A refusal has status 2 and names no address."""
     command = [sys.executable, ROOT / f"{script}.py"]
-    for encoding in ("cp1252", "cp437"):
-        environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": encoding}
-        result = subprocess.run([*command, "--help"], env=environ, capture_output=True)
-        assert result.returncode == 0 and not result.stderr, result.stderr
-        assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
+    environ = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "cp437"}
+    result = subprocess.run([*command, "--help"], env=environ, capture_output=True)
+    assert result.returncode == 0 and not result.stderr, result.stderr
+    assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
     result = subprocess.run([*command, "--env-id", "NoSuchTask-v0"], capture_output=True, text=True)
     assert result.returncode == 2 and not result.stdout
     assert result.stderr.startswith("error: --env-id NoSuchTask-v0") and result.stderr.count("\n") == 1
@@ -462,9 +488,9 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
     arguments = flags("dqn_cartpole", "a run", "--num-iterations", 10**6)
     command = [sys.executable, program, *arguments]
     process = subprocess.Popen(command, env=environ, cwd=here, stdout=subprocess.PIPE, text=True)
-    wait_until((here / "a run" / "train.csv").exists, 60)
+    wait_until((here / "a run" / "train.csv").exists)
     process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0 and "warning" not in output
     assert (here / "a run" / "learning_curve.png").stat().st_size > 0
     hint = output.splitlines()[-1].partition("checkpoint: ")[2]
@@ -516,35 +542,39 @@ def test_dead_evaluation_worker(script, tmp_path):
 def test_workers_end_with_the_main_process(script, tmp_path):
     """Which is killed in the midst of everything, while its workers work."""
     run = Process(script, flags(script, tmp_path / "run", "--num-iterations", 10**6), tmp_path / "output")
-    wait_until((tmp_path / "run" / "train.csv").exists, seconds=600)
+    wait_until((tmp_path / "run" / "train.csv").exists)
     assert len(session(run.pid)) > 1
     run.kill()
     assert run.wait() == -signal.SIGKILL
 
 
-def test_a_second_interrupt_does_not_wait_for_a_task_that_does_not_close(tmp_path):
+@pytest.mark.parametrize("interrupts, factor", [(1, 0.01), (2, 1000)])
+def test_a_task_that_does_not_close_is_waited_for_until_a_deadline_or_a_second_interrupt(interrupts, factor, tmp_path):
     arguments = flags("sac_minitaur", tmp_path / "run", "--num-iterations", 10**6)
-    run = Process("sac_minitaur", arguments, tmp_path / "output", never_close)
-    wait_until((tmp_path / "run" / "train.csv").exists, 60)
+    run = Process("sac_minitaur", arguments, tmp_path / "output", partial(never_close, factor=factor))
+    wait_until((tmp_path / "run" / "train.csv").exists)
     run.kill(signal.SIGINT)
-    wait_until(lambda: "stopped at step" in run.stdout, 60)
-    run.kill(signal.SIGINT)
-    assert run.wait(9) == 130 and "Traceback" not in run.stderr  # within the ten seconds that a task has to close
+    wait_until(lambda: "stopped at step" in run.stdout)
+    if interrupts == 2:
+        run.kill(signal.SIGINT)
+    assert run.wait() == (130 if interrupts == 2 else 0) and "Traceback" not in run.stderr
 
 
-def never_close(module):
-    """Once an episode has begun: gymnasium closes one environment before."""
-    common.SeededEpisodes.close = lambda env: time.sleep(600 * hasattr(env, "total"))
+def never_close(module, factor):
+    """Once an episode has begun: gymnasium closes one environment before. Deadlines are multiplied by the factor."""
+    common.SeededEpisodes.close = lambda env: time.sleep(10**6 * hasattr(env, "total"))
+    join = BaseProcess.join
+    BaseProcess.join = lambda process, timeout=None: join(process, timeout and factor * timeout)
 
 
 def test_a_second_interrupt_does_not_wait_for_a_task_that_is_being_made(tmp_path):
     hook = partial(never_made, begun=tmp_path / "begun")
     run = Process("sac_minitaur", flags("sac_minitaur", tmp_path / "run"), tmp_path / "output", hook)
-    wait_until((tmp_path / "begun").exists, 60)
+    wait_until((tmp_path / "begun").exists)
     run.kill(signal.SIGINT)
-    wait_until(lambda: "stopping" in run.stderr, 60)
+    wait_until(lambda: "stopping" in run.stderr)
     run.kill(signal.SIGINT)
-    assert run.wait(9) == 130 and "Traceback" not in run.stderr
+    assert run.wait() == 130 and "Traceback" not in run.stderr
 
 
 def never_made(module, begun):
@@ -554,7 +584,7 @@ def never_made(module, begun):
     def wait(env, *arguments):
         if multiprocessing.parent_process():
             begun.touch()
-            time.sleep(600)
+            time.sleep(10**6)
         init(env, *arguments)
 
     common.SeededEpisodes.__init__ = wait
@@ -595,9 +625,9 @@ def train_in_a_pool(module):
     module.main = main
 
 
-def test_films_without_a_display(script, tmp_path):
-    arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
-    run = Process(script, arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
+def test_films_without_a_display(tmp_path):
+    arguments = flags("dqn_cartpole", tmp_path / "run", "--video", "--num-iterations", 20)
+    run = Process("dqn_cartpole", arguments, tmp_path / "output", XDG_RUNTIME_DIR="")
     assert run.wait() == 0 and not run.stderr, run.stderr
     for name in ("trained_agent.mp4", "random_agent.mp4", "learning.mp4"):
         with imageio.get_reader(tmp_path / "run" / name) as video:
@@ -632,9 +662,9 @@ class Blinking(gym.Env):
         Blinking.closed += 1
 
 
-def film(path, parts=((None, None, None),), **arguments):
+def film(path, *more, clips=((None, None, None),), **arguments):
     task = gym.envs.registration.EnvSpec("Blinking-v0", Blinking, disable_env_checker=True, kwargs=arguments)
-    common.film(parts, task, 0, path)
+    common.film(clips, task, 0, path, *more)
 
 
 def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
@@ -644,12 +674,16 @@ def test_films_in_real_time_at_50_frames_a_second_or_fewer(tmp_path):
         assert video.get_meta_data()["fps"] == 40
     assert brightness == pytest.approx([24 * i for i in range(11)], abs=3)  # every third step, and the last
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    film(tmp_path / "film.mp4", 0.1, 30)
+    with imageio.get_reader(tmp_path / "film.mp4") as video:
+        assert [frame.mean() for frame in video] == pytest.approx([32 * i for i in range(4)], abs=3)  # of 12 steps
 
 
 def test_a_film_has_a_part_with_a_caption_for_each_policy(tmp_path):
     policy, played = mock.Mock(), []
     policy.act = lambda observation: played.append(policy.load_state_dict.call_args[0][0]) or 0
-    film(tmp_path / "film.mp4", [(policy, "first weights", "1"), (policy, "more", "7 updates"), (None, None, None)])
+    clips = [(policy, "first weights", "1"), (policy, "more", "7 updates"), (None, None, None)]
+    film(tmp_path / "film.mp4", clips=clips)
     assert played == 30 * ["first weights"] + 30 * ["more"]
     with imageio.get_reader(tmp_path / "film.mp4") as video:
         first, second, third = np.float32([frame for frame in video]).reshape(3, 11, 16 * 16 * 3)
@@ -673,15 +707,27 @@ def test_a_film_that_the_disk_has_no_room_for_leaves_nothing(small_disk, monkeyp
     assert [path.name for path in small_disk.iterdir()] == ["other people's"]
 
 
-def test_failing_film_costs_a_line_only(script, tmp_path):
-    arguments = flags(script, tmp_path / "run", "--video", "--num-iterations", 20)
-    run = finish(script, arguments, tmp_path / "output", die_filming)
+def test_failing_film_costs_a_line_only(tmp_path):
+    arguments = flags("dqn_cartpole", tmp_path / "run", "--video", "--num-iterations", 20)
+    run = finish("dqn_cartpole", arguments, tmp_path / "output", die_filming)
     assert "warning: no trained_agent.mp4" in run.stdout and not run.stderr
     assert (tmp_path / "run" / "policy.pt2").exists()
 
 
 def die_filming(module):
     before_call(imageio, "get_writer", 1, die)
+
+
+def test_the_curve_shows_the_tables(reference, monkeypatch, tmp_path):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    common.plot_learning_curve(tmp_path / "curve.png", tables := checkpoint(reference)["tables"], "title", 195.0)
+    returns, losses, values = ([line.get_xydata().T.tolist() for line in axes.lines] for axes in figures[0].axes)
+    loss = "loss" if "loss" in tables["train"][0] else "critic_loss"
+    drawn = (returns, "eval", "average_return"), (losses, "train", loss), (values, "train", "mean_q")
+    for lines, table, name in drawn:
+        assert [[row["step"] for row in tables[table]], [row[name] for row in tables[table]]] in lines
+    assert [y for _, y in returns[1:]] == [2 * [tables["random"][0]["average_return"]], [195.0, 195.0]]
 
 
 def with_nan_rewards(module):

@@ -36,7 +36,7 @@ CYCLES = int(os.environ.get("SOAK_CYCLES", 3))
 
 
 def collecting(module):
-    before_call(getattr(module, AGENTS[module.__name__]), "random_actions", 40, die)
+    before_random_actions(module, 40, die)
 
 
 def updating(module):
@@ -88,24 +88,36 @@ def test_reference_is_worth_comparing_with(script, reference):
     files = {"config.json", "random.csv", "policy.pt", "policy.pt2", "best_policy.pt", "best_policy.pt2"}
     assert files <= {path.name for path in reference.iterdir()} and list(reference.glob("events.out.tfevents.*"))
     assert (reference / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(reference.glob("*.mp4"))  # --no-video
     # The speed is that of the updates since the last row.
     first, *later = read_csv(reference / "train.csv")
+    if finished := own["environments"]["finished"]:  # the last ten; a pendulum's first episode is not over yet
+        assert len(finished) == 10 and len(set(finished)) > 1
+        shown = [later[-1]["collect_return"], later[-1]["collect_episode_length"]]
+        assert shown == pytest.approx(list(np.mean(finished, axis=0)))
     seconds = sum(20 / row["steps_per_second"] for row in later)
     assert seconds == pytest.approx(later[-1]["seconds"] - first["seconds"], abs=0.1)
 
 
-def test_the_same_seed_gives_the_same_bits(script, reference, tmp_path):
+def test_the_same_seed_gives_the_same_bits(script, reference, monkeypatch, tmp_path):
     """Another gives other networks, actions and episodes."""
     module = importlib.import_module(script)
     config = json.loads((reference / "config.json").read_text())
     assert_same_run(module.train(module.Config(**config | {"run_dir": tmp_path / "same"})), reference)
-    other = checkpoint(module.train(module.Config(**config | {"run_dir": tmp_path / "other", "seed": 1})))
-    mine = checkpoint(reference)
-    tensors = {name: tensor for name, tensor in mine["agent"].items() if torch.is_tensor(tensor)}
-    matrices = [name for name, tensor in tensors.items() if tensor.dim() == 2 and len(tensor.unique()) > 1]
-    assert matrices and not any(torch.equal(mine["agent"][name], other["agent"][name]) for name in matrices)
-    assert not torch.equal(mine["ranks"][0]["buffer"]["rows"][:, :2], other["ranks"][0]["buffer"]["rows"][:, :2])
-    assert mine["tables"]["random"][0]["average_return"] != other["tables"]["random"][0]["average_return"]
+    networks, start = [], common.Run.start
+    monkeypatch.setattr(common.Run, "start", lambda *args: networks.append(copy.deepcopy(args[1])) or start(*args))
+    one_update, states = config | {"num_iterations": 1}, []
+    for seed in range(2):
+        path = module.train(module.Config(**one_update | {"run_dir": tmp_path / f"{seed}", "seed": seed}))
+        states.append(checkpoint(path))
+    matrices = [[p for p in agent.parameters() if p.dim() == 2 and p.unique().numel() > 1] for agent in networks]
+    assert matrices[0] and not any(torch.equal(*pair) for pair in zip(*matrices))
+    size = 3 if script == "sac_minitaur" else 4  # of an observation
+    mine, other = (state["ranks"][0]["buffer"]["rows"] for state in states)
+    assert not torch.equal(mine[:96, size], other[:96, size])  # the random actions
+    assert (mine[:2, :size] != other[:2, :size]).any(1).all()  # the episodes' first observations
+    mine, other = (state["tables"]["random"][0]["average_return"] for state in states)
+    assert mine != other
 
 
 def test_killed_at_every_moment_and_resumed(script, reference, tmp_path):
@@ -117,12 +129,12 @@ def test_killed_at_every_moment_and_resumed(script, reference, tmp_path):
         for path in (tmp_path / "run").glob("*.csv"):
             rows(path)
         arguments = ["--resume", tmp_path / "run"]
-    assert not list((tmp_path / "run").glob("[!.]*.mp4"))
+    assert not list((tmp_path / "run").glob("[!.]*.mp4")) and list((tmp_path / "run").glob(".tmp-*.mp4"))
     (tmp_path / "run" / "notes.csv").write_text("a student's own\n")
     finish(script, [*arguments, "--no-video"], tmp_path / "last")
     assert_same_run(tmp_path / "run", reference)
     assert_tensorboard_once(tmp_path / "run")
-    assert (tmp_path / "run" / "notes.csv").exists()
+    assert (tmp_path / "run" / "notes.csv").exists() and not list((tmp_path / "run").glob(".tmp-*"))
 
 
 def assert_tensorboard_once(run_dir):
@@ -151,6 +163,7 @@ def test_raised_run_equals_a_longer_one(script, reference, tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert_same_run(tmp_path / "run", reference)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["num_iterations"] == 300
 
 
 def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
@@ -170,8 +183,12 @@ def test_the_best_policy_is_the_checkpoints_again(script, reference, tmp_path):
 
 
 def test_metrics_of_a_fork(script, reference, tmp_path, monkeypatch):
-    """A new one, a Python number, is a new column. An evaluation may return numpy's numbers: no checkpoint has them."""
+    """A new one, a Python number, is a new column. An evaluation may return numpy's numbers: no checkpoint has them.
+
+    The seconds count on from the checkpoint's.
+    """
     shutil.copytree(reference, run := tmp_path / "run")
+    torch.save(checkpoint(run) | {"seconds": 1e6}, run / "checkpoint.pt")
     module = importlib.import_module(script)
     log, (columns, *before) = common.Run.log_training, rows(run / "train.csv")
     monkeypatch.setattr(common.Run, "log_training", lambda run, step, metrics: log(run, step, metrics | {"one": 1}))
@@ -181,6 +198,7 @@ def test_metrics_of_a_fork(script, reference, tmp_path, monkeypatch):
         table = rows(run / "train.csv")
         assert table[:16] == [[*columns, "one"], *([*row, "nan"] for row in before)]
         assert [(row[0], row[-1]) for row in table[16:]] == [(str(i), "1.0") for i in range(320, steps + 1, 20)]
+        assert read_csv(run / "train.csv")[-1]["seconds"] > 1e6
     assert_tensorboard_once(run)
 
 
@@ -223,28 +241,38 @@ def evaluate_in_numpy(policy, task, seed):
 
 
 def stop_and_continue(script, run_dir, output, arguments, hook):
-    """Stops a run by the hook's signal and follows the command that it ends with. Returns the step it stopped at."""
+    """Stops a run by the hook's signal and follows the command that it ends with.
+
+    Returns the numbers of updates and of environment steps when it stopped.
+    """
     run = finish(script, arguments, output / "stopped", hook)
     last = run.stdout.splitlines()[-1]
-    step = checkpoint(run_dir)["step"]
-    assert f"stopped at step {step};" in last
+    state = checkpoint(run_dir)
+    assert f"stopped at step {state['step']};" in last
     assert run.stderr.strip() == "stopping: saving a checkpoint first (Ctrl-C again stops at once)"
     assert (run_dir / "learning_curve.png").stat().st_size > 0 and not list(run_dir.glob("*.pt2"))
     finish(script, shlex.split(re.search(rf"python {script}\.py (--resume .+)$", last)[1]), output / "continued")
-    return step
+    return state["step"], state["env_steps"]
 
 
 def test_stop_and_continue(script, reference, tmp_path):
     """A checkpoint at this very step, the curve, and a line with the command that continues, quoted for a shell."""
-    arguments = flags(script, tmp_path / "a run", "--num-envs", 2)
-    assert stop_and_continue(script, tmp_path / "a run", tmp_path, arguments, signal_the_group) == 110
-    assert_same_run(tmp_path / "a run", reference)
+    for moment, stopped in ((before_update, (110, 96 + 110)), (before_random_actions, (0, 2 * 20))):
+        run = tmp_path / f"{stopped[0]}" / "a run"
+        arguments = flags(script, run, "--num-envs", 2)
+        hook = partial(signal_the_group, moment=moment)
+        assert stop_and_continue(script, run, run.parent, arguments, hook) == stopped
+        assert_same_run(run, reference)
 
 
-def signal_the_group(module):
+def before_random_actions(module, count, action):
+    before_call(getattr(module, AGENTS[module.__name__]), "random_actions", count, action)
+
+
+def signal_the_group(module, moment):
     """As a terminal and torchrun do."""
     number = signal.SIGTERM if module.__name__ == "sac_minitaur" else signal.SIGINT
-    before_update(module, 110, lambda: os.killpg(0, number))
+    moment(module, 110 if moment is before_update else 20, lambda: os.killpg(0, number))
 
 
 def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path):
@@ -252,7 +280,7 @@ def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path):
     arguments = flags(script, tmp_path / "run", "--num-envs", 2)
     step = 100 if script == "sac_minitaur" else 300
     hook = partial(hang_up_in_an_evaluation, step=step)
-    assert stop_and_continue(script, tmp_path / "run", tmp_path, arguments, hook) == step
+    assert stop_and_continue(script, tmp_path / "run", tmp_path, arguments, hook)[0] == step
     assert_same_run(tmp_path / "run", reference)
 
 
@@ -322,15 +350,15 @@ def train_seeds(module):
         values = {"num_iterations": 10**6, "initial_collect_steps": 96, "batch_size": 24, "log_interval": 20}
         values |= dict(zip(["env_id"], TASK[module.__name__][1:]))
         path, processes = Path(sys.argv[1]), []
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited, as from a shell that starts it in the background
         for seed in range(2):
             config = module.Config(seed=seed, run_dir=path / f"{seed}", num_eval_episodes=1, device="cpu", **values)
             processes.append(multiprocessing.Process(target=module.train, args=(config,)))
             processes[-1].start()
         for seed, process in enumerate(processes):
-            wait_until((path / f"{seed}" / "train.csv").exists, 600)
+            wait_until((path / f"{seed}" / "train.csv").exists)
         os.kill(processes[0].pid, signal.SIGTERM)
         processes[0].join()
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         os.killpg(0, signal.SIGINT)
         processes[1].join()
 

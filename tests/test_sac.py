@@ -19,7 +19,7 @@ from torch.distributions import Independent, Normal, TanhTransform, TransformedD
 
 import common
 import sac_minitaur
-from runs import ROOT, checkpoint, load_policy, read_csv
+from runs import ROOT, checkpoint, load_policy, read_command_line, read_csv
 from sac_minitaur import Actor, Config, Policy, ReplayBuffer, SACAgent
 
 # The tutorials' values, here written down a second time.
@@ -211,6 +211,7 @@ def test_update_is_one_step_of_each_gradient(batch_norm):
     critic_gradients = torch.autograd.grad(loss, list(critics.parameters()))
     adam_step(critics.parameters(), critic_gradients, config.critic_learning_rate)
     assert metrics["critic_loss"].item() == pytest.approx(loss.item(), rel=1e-5)
+    assert metrics["mean_q"].item() == pytest.approx(q.mean().item(), rel=1e-4)
     # The critics moved by their own loss alone: the actor's left them neither a gradient nor a step.
     for own, expected, gradient in zip(agent.critics.parameters(), critics.parameters(), critic_gradients):
         torch.testing.assert_close(own, expected, rtol=1e-5, atol=1e-6)
@@ -297,6 +298,7 @@ def test_the_tutorials_values_are_the_defaults():
     assert config.actor_layers == config.critic_layers == (256, 256)
     assert (config.log_interval, config.eval_interval, config.num_eval_episodes) == (5_000, 10_000, 20)
     assert config.checkpoint_interval == 5_000 and config.critic_loss_weight == 0.5
+    assert config.adam_epsilon == 1e-7 and config.initial_log_alpha == 0
 
 
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
@@ -413,8 +415,11 @@ def train(path, **choices):
     return path, calls
 
 
-def test_train_does_what_the_config_says_and_writes_its_rows(tmp_path):
+def test_train_does_what_the_config_says_and_writes_its_rows(tmp_path, monkeypatch):
+    sizes, sample = [], ReplayBuffer.sample
+    monkeypatch.setattr(ReplayBuffer, "sample", lambda self, count: sizes.append(self.size) or sample(self, count))
     path, calls = train(tmp_path / "run")
+    assert sizes == list(range(250, 310))  # the step that each update needs runs during the update
     assert [name for name, _ in calls] == ["fit_reward_scale"] + 60 * ["update"]
     (rewards,) = calls[0][1]
     assert rewards.shape == (250,)
@@ -582,6 +587,7 @@ def test_values_out_of_range_are_refused_by_name(arguments, monkeypatch, capfd):
         ("--env-id :y-v0", ":y-v0"),
         ("--env-id CartPole-v1", "Discrete"),
         ("--device cuda:77", "cuda:77"),
+        ("--device mps", "--device mps is not there"),
         ("--device cpu --cuda-graph", "with a CUDA GPU: use --no-cuda-graph"),
         ("--batch-size 300", "--batch-size 300"),
         ("--replay-buffer-capacity 9000000000000000", "--replay-buffer-capacity 9000000000000000 takes 324000000.0 GB"),
@@ -634,9 +640,25 @@ def test_spaces_that_sac_cannot_use(kind, space, monkeypatch):
         common.find_task(Config(env_id="Task-v0"), gym.spaces.Box)
 
 
-def test_the_report_reads_every_run(monkeypatch, capsys):
+def test_readmes_tables_of_our_choices_are_the_reports(monkeypatch, capsys):
     spec = importlib.util.spec_from_file_location("report", ROOT / "results" / "report.py")
     spec.loader.exec_module(report := importlib.util.module_from_spec(spec))
     monkeypatch.setattr(report, "FIGURES", {})  # draws nothing
     report.main()
-    assert {"### sac_minitaur", "### sac_hopper"} <= set(capsys.readouterr().out.splitlines())
+    printed, readme = (
+        [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+        for text in (capsys.readouterr().out, (ROOT / "README.md").read_text().replace("−", "-"))
+    )
+    sac = {(at_10000, at_20000, at_50000) for _, at_10000, at_20000, _, at_50000 in (r for r in printed if len(r) == 5)}
+    dqn = {(early, stay) for _, _, early, _, stay, _ in (row for row in printed if len(row) == 6)}
+    rows = [tuple(row[4:]) for row in readme if re.fullmatch(r"-?\d+\.\d( -?\d+\.\d){2}|\d+ \d+", " ".join(row[4:]))]
+    assert len(rows) == 10 + 8 and set(rows) <= sac | dqn
+
+
+def test_commands_of_readme_and_docstrings_are_taken():
+    text = "\n".join((ROOT / name).read_text() for name in ("README.md", "sac_minitaur.py", "dqn_cartpole.py"))
+    commands = re.findall(r"(?:python|nproc-per-node \w+) (\w+)\.py((?: +-{1,2}[^`#\n]*)?)", text)
+    assert len(commands) > 20
+    for script, arguments in commands:
+        arguments = re.sub(r"--(resume|evaluate) runs/\S+|--seed S|--help", "", arguments)
+        read_command_line(script, *arguments.split())

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +36,7 @@ class Echo(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
+        assert torch.get_num_threads() == 1  # what a worker uses
         if self.fails == "reset":
             raise self.error()
         self.state[:] = 0
@@ -72,8 +72,8 @@ class Helped(gym.Wrapper):
 
     def __init__(self, env_id):
         super().__init__(gym.make(env_id))
-        self.program = subprocess.Popen(["sleep", "600"])
-        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
+        self.program = subprocess.Popen(["sleep", "1000000"])
+        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(10**6,))
         self.process.start()
 
     def step(self, action):
@@ -145,9 +145,7 @@ def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, regi
     assert torch.equal(exported, load_policy(path / "policy.pt")(observations))
 
 
-@pytest.mark.parametrize(
-    "dtype, scale", [(np.float32, 10), (np.float32, 1.7e38), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)]
-)
+@pytest.mark.parametrize("dtype, scale", [(np.float32, 10), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)])
 def test_actions_never_leave_the_bounds(dtype, scale, register):
     random = np.random.default_rng(0)
     low, high = np.sort(random.uniform(-scale, scale, (2, 300)).astype(dtype), axis=0)
@@ -257,7 +255,7 @@ def test_a_task_that_returns_what_no_space_of_its_has(when, wrong, said, monkeyp
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-@pytest.mark.parametrize("error", [ConnectionError, EOFError, BrokenProcessPool, partial(TwoArguments, 7), SystemExit])
+@pytest.mark.parametrize("error", [ConnectionError, partial(TwoArguments, 7), SystemExit])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
 def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path, capsys):
     with pytest.raises(common.TaskError) as caught:
@@ -294,9 +292,9 @@ def test_ctrl_c_stops_the_run_and_nothing_that_its_task_has_started(script, tmp_
     task = f"{__name__}:Helped{'Box' if script == 'sac_minitaur' else 'Discrete'}-v0"
     more = ["--num-iterations", 10**6, "--max-episode-steps", 20, "--eval-interval", 10**6]
     run = Process(script, flags(script, tmp_path / "run", "--env-id", task, *more), tmp_path / "output")
-    wait_until((tmp_path / "run" / "train.csv").exists, 60)
+    wait_until((tmp_path / "run" / "train.csv").exists)
     os.killpg(run.pid, signal.SIGINT)
-    assert run.wait(60) == 0 and "stopped at step" in run.stdout, run.stderr
+    assert run.wait() == 0 and "stopped at step" in run.stdout, run.stderr
     assert run.stderr.count("stopping") == 1 and "Traceback" not in run.stderr
 
 
@@ -406,7 +404,7 @@ def test_an_episode_that_cannot_be_played_again_on_resume(change, monkeypatch, t
     assert len(rows) == 40 + 40 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
 
 
-@pytest.mark.parametrize("env_id", [IDS["env_id"], "Pendulum-v1", "MinitaurBulletEnv-v0"])
+@pytest.mark.parametrize("env_id", [IDS["env_id"], "MinitaurBulletEnv-v0"])
 @pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
 def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
     if env_id == "MinitaurBulletEnv-v0":
