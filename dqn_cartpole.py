@@ -222,7 +222,7 @@ class DQNAgent(nn.Module):
         self.to(device)
         adam = {"eps": config.adam_epsilon, "fused": True}  # fused: one operation for all parameters
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), config.learning_rate, **adam)
-        self.optimizers = [self.optimizer]  # for the checkpoint
+        self.optimizers = [self.optimizer]  # for the checkpoint; add a scheduler here
 
     def random_actions(self, count):
         """Uniform actions (K,), numpy."""
@@ -259,7 +259,7 @@ class DQNAgent(nn.Module):
         here would make the CPU wait for the GPU.
         """
         config = self.config
-        if config.learning_rate_decay:  # ours: lr / (1 + (step / decay)²)
+        if config.learning_rate_decay:  # ours, set at every update: lr / (1 + (step / decay)²)
             self.optimizer.param_groups[0]["lr"] = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
         s, next_s = self.scaling(s), self.scaling(next_s)  # ours
@@ -295,7 +295,7 @@ def evaluate(policy, task, seed):
 
 
 def train(config):
-    """Trains as `config` says and returns the run directory's path.
+    """Trains as `config` says and returns the run directory's path, after Ctrl-C, too.
 
     Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
     stay. A resumed run equals an uninterrupted one: `common.SeededEpisodes` plays the running episodes again.

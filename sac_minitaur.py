@@ -274,7 +274,7 @@ class SACAgent(nn.Module):
         actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
         alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
         self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # `update` adds up their losses
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint; add a scheduler here
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
@@ -429,7 +429,7 @@ def make_training_env(task, privileged):
 
 
 def train(config):
-    """Trains as `config` says and returns the run directory's path.
+    """Trains as `config` says and returns the run directory's path, after Ctrl-C, too.
 
     Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
     stay. A resumed run equals an uninterrupted one: `common.SeededEpisodes` plays the running episodes again.

@@ -208,16 +208,16 @@ def test_what_a_fork_keeps(script, reference, tmp_path, monkeypatch):
     buffer, agent = module.ReplayBuffer, getattr(module, AGENTS[script])
     init, add, update = buffer.__init__, buffer.add, agent.update
 
-    def with_ages(self, capacity, *more):
-        init(self, capacity, *more)
+    def with_ages(self, capacity, *more, **named):
+        init(self, capacity, *more, **named)
         self.ages = torch.zeros(capacity)
 
-    def older(self, *step):
-        add(self, *step)
+    def older(self, *step, **named):
+        add(self, *step, **named)
         self.ages += 1
 
-    def with_numpys_learning_rate(self, *batch):
-        metrics = update(self, *batch)
+    def with_numpys_learning_rate(self, *batch, **named):
+        metrics = update(self, *batch, **named)
         self.optimizers[0].param_groups[0]["lr"] = np.float64(1e-3)
         return metrics
 
