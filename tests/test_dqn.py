@@ -237,7 +237,11 @@ def test_what_is_filmed(monkeypatch, tmp_path):
     """The trained agent, a random one, and five policies, closer to each other at the beginning."""
     films, done = {}, futures.Future()
     done.set_result(None)
-    record = lambda run, clips, name, *more: films.update({name: copy.deepcopy(clips)}) or done  # noqa: E731
+
+    def record(run, clips, name, *more):
+        films[name] = copy.deepcopy(clips)
+        return done
+
     monkeypatch.setattr(common.Run, "_film", record)
     choices = {"eval_interval": 5, "video": True, "run_dir": tmp_path / "run"}
     path = dqn_cartpole.train(dataclasses.replace(TINY, **choices))

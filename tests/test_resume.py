@@ -257,10 +257,10 @@ def stop_and_continue(script, run_dir, output, arguments, hook):
 
 def test_stop_and_continue(script, reference, tmp_path):
     """A checkpoint at this very step, the curve, and a line with the command that continues, quoted for a shell."""
-    for moment, stopped in ((before_update, (110, 96 + 110)), (before_random_actions, (0, 2 * 20))):
+    for moment, count, stopped in ((before_update, 110, (110, 96 + 110)), (before_random_actions, 20, (0, 2 * 20))):
         run = tmp_path / f"{stopped[0]}" / "a run"
         arguments = flags(script, run, "--num-envs", 2)
-        hook = partial(signal_the_group, moment=moment)
+        hook = partial(signal_the_group, moment=moment, count=count)
         assert stop_and_continue(script, run, run.parent, arguments, hook) == stopped
         assert_same_run(run, reference)
 
@@ -269,10 +269,10 @@ def before_random_actions(module, count, action):
     before_call(getattr(module, AGENTS[module.__name__]), "random_actions", count, action)
 
 
-def signal_the_group(module, moment):
+def signal_the_group(module, moment, count):
     """As a terminal and torchrun do."""
     number = signal.SIGTERM if module.__name__ == "sac_minitaur" else signal.SIGINT
-    moment(module, 110 if moment is before_update else 20, lambda: os.killpg(0, number))
+    moment(module, count, lambda: os.killpg(0, number))
 
 
 def test_stop_while_an_evaluation_is_under_way(script, reference, tmp_path):
