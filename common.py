@@ -110,8 +110,9 @@ def complete_config(given, config_class, tutorial, script):
         rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
         if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
             raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
-    elif policy := values.get("evaluate"):  # it may lack a field that a fork added
+    elif policy := values.get("evaluate"):  # of another version it may have more or fewer fields
         rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
+        rest = {name: rest[name] for name in names & rest}
     return ArgsKwargs((), rest | values)
 
 
@@ -340,7 +341,7 @@ class SeededEpisodes(gym.Wrapper):
 class Environments:
     """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on (SAC: (K, S)).
 
-    `num_episodes` (K,) counts the episodes that have ended in each, `steps` the steps of all, over all processes.
+    `steps` counts the steps of all, over all processes.
     """
 
     def __init__(self, make_env, run, in_workers):
@@ -371,7 +372,6 @@ class Environments:
             self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self._end_workers if in_workers else self.vector.close)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
-        self.num_episodes = np.array(self.vector.get_attr("episode"))
         if saved.get("fingerprint") not in (None, self._fingerprint()):
             run.print("warning: an episode went differently when it was played again: this resume is not exact")
 
@@ -384,14 +384,13 @@ class Environments:
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). Where an episode ended, the next observation is its last, not the first of the next."""
+        observations (K, O). Where an episode ended, this is its last; `observations` has the first of the next one."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
         for i in np.flatnonzero(terminated | truncated):
             next_observations[i] = infos["final_obs"][i]
             self.finished.append((float(infos["final_info"]["return"][i]), int(infos["final_info"]["length"][i])))
-        self.num_episodes += terminated | truncated
         return observations, self.actions, rewards, terminated, next_observations
 
     def recent(self):
@@ -401,7 +400,7 @@ class Environments:
 
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
-        episodes = list(zip(self.num_episodes.tolist(), actions))
+        episodes = list(zip(self.vector.get_attr("episode"), actions))
         return {"episodes": episodes, "finished": list(self.finished), "fingerprint": self._fingerprint()}
 
     def _fingerprint(self):

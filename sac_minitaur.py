@@ -61,7 +61,6 @@ class Config:
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
-    mean_action_episodes: bool = True  # ours (theirs: no): every second episode is collected by the evaluated policy
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each dimension of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
@@ -91,7 +90,7 @@ class Config:
 TUTORIAL = dict(
     replay_buffer_capacity=10_000, actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
     adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False, reward_scale_factor=1.0,
-    averaged_actor_tau=1.0, mean_action_episodes=False, target_entropy_per_action=-0.5,
+    averaged_actor_tau=1.0, target_entropy_per_action=-0.5,
 )  # fmt: skip
 
 
@@ -292,15 +291,10 @@ class SACAgent(nn.Module):
             self.reward_scale /= torch.where(std > 1e-6 * mean.abs(), std, 1.0)
 
     @torch.no_grad()
-    def act(self, observations, deterministic):
-        """Actions (K, *action shape) in [-1, 1] for flat observations (K, S), from numpy to numpy.
-
-        True in `deterministic` (K,) takes the evaluated policy's action, False samples the actor's.
-        """
+    def act(self, observations):
+        """Sampled actions (K, *action shape) in [-1, 1] for flat observations (K, S), from numpy to numpy."""
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
         actions, _ = self.actor.sample(observations)
-        mean, _ = self.policy.actor(observations)
-        actions = torch.where(torch.as_tensor(deterministic, device=self.device)[:, None], mean.tanh(), actions)
         actions = actions.view(-1, *self.action_shape).cpu().numpy()
         require_finite(actions)
         return actions
@@ -462,8 +456,7 @@ def train(config):
             due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
             collecting = envs.steps < due
             if collecting:
-                deterministic = config.mean_action_episodes & (envs.num_episodes % 2 == 1)  # (K,): odd episodes
-                envs.step_async(agent.act(envs.observations, deterministic))
+                envs.step_async(agent.act(envs.observations))
             if envs.steps >= due:  # step_async has counted the new steps
                 metrics = update(buffer.sample(batch_size))
                 step += 1

@@ -1,6 +1,7 @@
 """Prints README's tables and draws its figures from the CSVs beside this file: `python results/report.py`.
 
-`results/<experiment>/seed<k>/` holds the CSVs of one run. `tutorials.csv` holds what the TF-Agents tutorials print.
+`results/<experiment>/seed<k>/` holds the CSVs of one run, `results/earlier_defaults/` experiments with an earlier
+default. `tutorials.csv` holds what the TF-Agents tutorials print.
 """
 
 import csv
@@ -82,8 +83,8 @@ def print_table(experiment, goal, late):
 
 def print_sac_ablation(base, without, steps):
     """Median returns of `base` and of the runs without one choice after these updates, with the seeds of all."""
-    names = {path.name.removeprefix(without): path.name for path in RESULTS.glob(f"{without}*")}
-    curves = {label: runs(name) for label, name in ({"nothing": base} | names).items()}
+    names = [path.relative_to(RESULTS).as_posix() for path in RESULTS.glob(f"{without}*")]
+    curves = {"nothing": runs(base)} | {name.removeprefix(without): runs(name) for name in names}
     seeds = sorted(set.intersection(*map(set, curves.values())))
     print(f"\n### {base}, without one choice, medians of seeds {', '.join(map(str, seeds))}\n")
     print(f"| without | {' | '.join(map(str, steps))} |\n|{' --- |' * (len(steps) + 1)}")
@@ -131,18 +132,19 @@ def draw(name, title, threshold, published):
 
 
 def main():
-    for name in sorted({path.parts[-3] for path in RESULTS.glob("*/seed*/eval.csv")}):
+    for name in sorted({path.parents[1].relative_to(RESULTS).as_posix() for path in RESULTS.glob("**/eval.csv")}):
         if name in ("dqn_cartpole", "dqn_cartpole_v1", "dqn_cartpole_130000"):
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif "pendulum" in name:
             print_table(name, goal=-200, late=5_000)
         elif "_without_" in name:
             continue
-        elif name.startswith(("sac_hopper", "sac_halfcheetah")):
+        elif "hopper" in name or "halfcheetah" in name:
             print_table(name, goal=3_000, late=50_000)
-        elif name.startswith("sac"):
+        elif "sac" in name:
             print_table(name, goal=15, late=50_000)
-    print_sac_ablation("sac_minitaur", "sac_50000_without_", (10_000, 20_000, 30_000, 50_000))
+    earlier = "earlier_defaults/sac_minitaur", "earlier_defaults/sac_50000_without_"
+    print_sac_ablation(*earlier, (10_000, 20_000, 30_000, 50_000))
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)

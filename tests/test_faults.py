@@ -115,7 +115,10 @@ def test_damaged_or_foreign_file(script, copy, tmp_path, name):
 
 
 def test_checkpoint_of_another_version(script, copy):
-    """It has a field more or one less: nobody knows its value. One that may differ on resume has its default."""
+    """It has a field more or one less: nobody knows its value. One that may differ on resume has its default.
+
+    A policy of it is evaluated all the same.
+    """
     module, config = importlib.import_module(script), checkpoint(copy)["config"]
     older = {name: value for name, value in config.items() if name != "gamma"}
     for changed, field in ((older, "gamma"), (config | {"wings": 2}, "wings")):
@@ -125,7 +128,7 @@ def test_checkpoint_of_another_version(script, copy):
         everything = vars(module.Config()) | {"resume": copy}  # as dataclasses.replace gives it
         with pytest.raises(common.InputError, match=f"another version .*{field}"):
             module.Config(**everything)
-    change(copy / "policy.pt", config=older)
+    change(copy / "policy.pt", config=older | {"wings": 2})
     assert finish(script, ["--evaluate", copy / "policy.pt", "--no-video"], copy / "output").status == 0
     change(copy / "checkpoint.pt", config={name: value for name, value in config.items() if name != "num_threads"})
     finish(script, ["--resume", copy], copy / "continued")

@@ -26,7 +26,7 @@ from sac_minitaur import Actor, Config, Policy, ReplayBuffer, SACAgent
 TUTORIALS = dict(
     actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
     adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False,
-    reward_scale_factor=1, averaged_actor_tau=1, mean_action_episodes=False, target_entropy_per_action=-0.5,
+    reward_scale_factor=1, averaged_actor_tau=1, target_entropy_per_action=-0.5,
     replay_buffer_capacity=10_000,
 )  # fmt: skip
 
@@ -253,29 +253,16 @@ def test_a_forks_normalized_actor_is_evaluated_with_its_statistics():
     assert module[0].running_mean.all() and torch.equal(average[0].running_mean, module[0].running_mean)
 
 
-def test_act_samples_or_takes_the_mean():
-    agent = make_agent()
-    agent.update(make_batch())  # so that the averaged actor is not the actor
-    observations = torch.randn(4, 3)
-    torch.manual_seed(7)
-    actions = torch.from_numpy(agent.act(observations.numpy(), np.array([False, True, True, False])))
-    torch.manual_seed(7)
-    sampled, _ = agent.actor.sample(observations)
-    assert torch.equal(actions[::3], sampled[::3].detach())
-    torch.testing.assert_close(actions[1:3], agent.policy(observations)[1:3].detach())
-
-
 def test_only_the_critics_see_the_end_of_a_longer_observation():
     agent = make_agent(observation_size=3, state_size=5)
     agent.update(make_batch(observation_size=5))
     observations = torch.randn(4, 5)
     others = torch.cat((observations[:, :3], torch.randn(4, 2)), dim=1)
-    for deterministic in (np.zeros(4, bool), np.ones(4, bool)):
+    torch.manual_seed(7)
+    sampled, _ = agent.actor.sample(observations[:, :3])
+    for seen in (observations, others):
         torch.manual_seed(7)
-        actions = agent.act(observations.numpy(), deterministic)
-        torch.manual_seed(7)
-        assert (agent.act(others.numpy(), deterministic) == actions).all()
-    torch.testing.assert_close(agent.policy(observations[:, :3]), torch.from_numpy(actions))
+        assert torch.equal(torch.from_numpy(agent.act(seen.numpy())), sampled.detach())
     assert (agent.critics(observations, torch.zeros(4, 2)) != agent.critics(others, torch.zeros(4, 2))).all()
 
 
@@ -304,7 +291,7 @@ def test_the_tutorials_values_are_the_defaults():
 def test_tutorial_sets_every_value_that_is_ours_to_theirs():
     lines = (ROOT / "sac_minitaur.py").read_text().splitlines()
     ours = {line.split(":")[0].strip() for line in lines if re.search(r"^    \w+: .* # ours\b", line)}
-    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 12
+    assert TUTORIALS.keys() == sac_minitaur.TUTORIAL.keys() == ours and len(ours) == 11
     assert vars(Config(tutorial=True)) == vars(Config(**TUTORIALS)) | {"tutorial": True}
     given = {"adam_beta1": 0.7, "reward_scaling": True}  # counts beside it
     config = Config("Pendulum-v1", **given, tutorial=True)
@@ -417,7 +404,14 @@ def train(path, **choices):
 
 def test_train_does_what_the_config_says_and_writes_its_rows(tmp_path, monkeypatch):
     sizes, sample = [], ReplayBuffer.sample
+    actions, act = [], SACAgent.act
+
+    def recorded(self, observations):
+        actions.append(act(self, observations))
+        return actions[-1]
+
     monkeypatch.setattr(ReplayBuffer, "sample", lambda self, count: sizes.append(self.size) or sample(self, count))
+    monkeypatch.setattr(SACAgent, "act", recorded)
     path, calls = train(tmp_path / "run")
     assert sizes == list(range(250, 310))  # the step that each update needs runs during the update
     assert [name for name, _ in calls] == ["fit_reward_scale"] + 60 * ["update"]
@@ -425,7 +419,9 @@ def test_train_does_what_the_config_says_and_writes_its_rows(tmp_path, monkeypat
     assert rewards.shape == (250,)
     assert all(batch[0].shape == (32, 3) for _, (batch,) in calls[1:])
     state = checkpoint(path)
-    assert state["step"] == 60 and state["env_steps"] == len(state["ranks"][0]["buffer"]["rows"]) == 250 + 60
+    rows = state["ranks"][0]["buffer"]["rows"]
+    assert state["step"] == 60 and state["env_steps"] == len(rows) == 250 + 60
+    assert np.array_equal(rows[250:, 3:4], np.concatenate(actions))  # random ones first, then the agent's
     assert json.loads((path / "config.json").read_text())["num_iterations"] == 60
     evaluation = {"step", "env_steps", "seconds", "average_return", "std_return", "average_episode_length"}
     rows = read_csv(path / "random.csv")
@@ -440,21 +436,6 @@ def test_train_does_what_the_config_says_and_writes_its_rows(tmp_path, monkeypat
     assert metrics | {"seconds", "steps_per_second", "collect_return", "collect_episode_length"} <= set(rows[0])
     assert all(math.isfinite(value) for row in rows for value in row.values())
     assert rows[-1]["collect_episode_length"] == 200  # the one episode that ended is the random one
-
-
-@pytest.mark.parametrize("mean_action_episodes", (True, False))
-def test_every_second_episode_is_collected_by_the_mean_action(mean_action_episodes, tmp_path, monkeypatch):
-    """By default, not with --tutorial."""
-    act, flags = SACAgent.act, []
-
-    def recorded(self, observations, deterministic):
-        flags.extend(~deterministic)
-        return act(self, observations, deterministic)
-
-    monkeypatch.setattr(SACAgent, "act", recorded)
-    choices = dict(initial_collect_steps=150, num_iterations=270, tutorial=not mean_action_episodes)
-    train(tmp_path / "run", **choices)  # episodes of 200 steps
-    assert flags == 50 * [True] + 200 * [not mean_action_episodes] + 20 * [True]
 
 
 def test_several_environments_keep_the_ratio_of_collecting_to_updating(tmp_path):
@@ -652,7 +633,7 @@ def test_readmes_tables_of_our_choices_are_the_reports(monkeypatch, capsys):
     sac = {(at_10000, at_20000, at_50000) for _, at_10000, at_20000, _, at_50000 in (r for r in printed if len(r) == 5)}
     dqn = {(early, stay) for _, _, early, _, stay, _ in (row for row in printed if len(row) == 6)}
     rows = [tuple(row[4:]) for row in readme if re.fullmatch(r"-?\d+\.\d( -?\d+\.\d){2}|\d+ \d+", " ".join(row[4:]))]
-    assert len(rows) == 10 + 8 and set(rows) <= sac | dqn
+    assert len(rows) == 9 + 8 and set(rows) <= sac | dqn
 
 
 def test_commands_of_readme_and_docstrings_are_taken():
