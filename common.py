@@ -110,7 +110,7 @@ def complete_config(given, config_class, tutorial, script):
         rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
         if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
             raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
-    elif policy := values.get("evaluate"):  # of another version it may have more or fewer fields
+    elif policy := values.get("evaluate"):  # one of another version may have more fields, or fewer
         rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
         rest = {name: rest[name] for name in names & rest}
     return ArgsKwargs((), rest | values)
@@ -384,7 +384,7 @@ class Environments:
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). Where an episode ended, this is its last; `observations` has the first of the next one."""
+        observations (K, O). Where an episode ended, that is its last. `self.observations` has the next one's first."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()

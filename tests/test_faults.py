@@ -117,7 +117,7 @@ def test_damaged_or_foreign_file(script, copy, tmp_path, name):
 def test_checkpoint_of_another_version(script, copy):
     """It has a field more or one less: nobody knows its value. One that may differ on resume has its default.
 
-    A policy of it is evaluated all the same.
+    The policy of another version is evaluated all the same.
     """
     module, config = importlib.import_module(script), checkpoint(copy)["config"]
     older = {name: value for name, value in config.items() if name != "gamma"}
