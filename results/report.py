@@ -143,6 +143,7 @@ def main():
             print_table(name, goal=3_000, late=50_000)
         elif "sac" in name:
             print_table(name, goal=15, late=50_000)
+    print_sac_ablation("sac_minitaur", "sac_20000_without_", (10_000, 20_000))
     earlier = "earlier_defaults/sac_minitaur", "earlier_defaults/sac_50000_without_"
     print_sac_ablation(*earlier, (10_000, 20_000, 30_000, 50_000))
     print_dqn_ablation("dqn_cartpole")
