@@ -12,6 +12,7 @@ import csv
 import ctypes
 import dataclasses
 import errno
+import gc
 import io
 import math
 import multiprocessing
@@ -72,6 +73,7 @@ def run_main(main):
     # TensorBoard's thread would print a traceback about a full disk, which the main thread reports anyway.
     hook = threading.excepthook
     threading.excepthook = lambda args: "tensorboard" in type(args.thread).__module__ or hook(args)
+    atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
     try:
         return main()
     except (InputError, RunError, TaskError) as error:
@@ -211,6 +213,7 @@ class Ranks:
     def average(self, tensors):
         """Replaces each tensor by its mean over the ranks, in one collective for all of them."""
         if self.world_size > 1:
+            tensors = list(tensors)
             dist.all_reduce(flat := torch.cat([tensor.flatten() for tensor in tensors]))
             for tensor, total in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
                 tensor.copy_(total.view_as(tensor) / self.world_size)
@@ -601,7 +604,9 @@ class Run:
 
     def stop_requested(self, step):
         """Whether any rank was asked to stop. Several processes exchange messages for it, so not at every step."""
-        if self.ranks.world_size == 1 or step % 20 == 0 or step % self.config.eval_interval == 0:
+        if self.ranks.world_size == 1:
+            self.stopped = self.stopping
+        elif step % 20 == 0 or step % self.config.eval_interval == 0:
             self.ranks.average([stopping := torch.tensor(float(self.stopping))])
             self.stopped = bool(stopping > 0)
         return self.stopped

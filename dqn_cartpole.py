@@ -272,7 +272,7 @@ class DQNAgent(nn.Module):
         loss = F.mse_loss(q, y)  # mean (Q(s, a) − y)²
         self.optimizer.zero_grad()
         loss.backward()
-        self.ranks.average([parameter.grad for parameter in self.q_network.parameters()])  # over the processes
+        self.ranks.average(parameter.grad for parameter in self.q_network.parameters())  # over the processes
         self.optimizer.step()
 
         with torch.no_grad():  # the target network's weights: θ̄ ← θ̄ + τ (θ − θ̄)
