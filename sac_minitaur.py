@@ -70,7 +70,7 @@ class Config:
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Parallel = 1  # CPU threads of the update: 1 is enough on two cores, 4 on sixteen
+    num_threads: common.Parallel = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
     cuda_graph: bool = False  # on a GPU: record the update and replay it, about twice as fast: see `cuda_graph`
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
