@@ -35,6 +35,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import torch
@@ -466,9 +467,10 @@ def export_policy(path, policy, observation_shape):
     write_atomically(path, lambda file: file.write(archive.getvalue()))
 
 
-def _in_worker(function, file, *arguments):
+def _in_worker(file, *arguments):
     with telling_task_errors("the task or the policy"):
-        return function(pickle.loads(file.read_bytes()), start_worker.task.fn, *arguments)
+        function, large = pickle.loads(file.read_bytes())
+        return function(large, start_worker.task.fn, *arguments)
 
 
 def say(line):
@@ -588,10 +590,9 @@ class Run:
         if not (self.directory / "checkpoint.pt").exists():
             return "there is no checkpoint yet"
         python = f"torchrun --nproc-per-node {n}" if (n := self.ranks.world_size) > 1 else "python"
-        module = sys.modules.get(type(self.config).__module__)  # a fork's script has a name of its own
-        if not hasattr(module, "__file__"):  # a notebook's cells
+        file = Path(getattr(sys.modules.get(type(self.config).__module__), "__file__", "a notebook's cells"))
+        if file.name != Path(sys.argv[0]).name:  # not this script runs, but a notebook or a program that calls `train`
             return f"to continue from the last checkpoint: train(Config(resume={str(self.path)!r}))"
-        file = Path(module.__file__)
         program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
         return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
 
@@ -626,10 +627,11 @@ class Run:
                 agent.load_state_dict(saved["agent"])
                 for name, stored in replay.items():
                     getattr(buffer, name)[: buffer.size] = stored
-            except (AttributeError, RuntimeError):  # the former for a tensor that the replay no longer has
-                raise InputError(f"{config.resume} does not fit {config.env_id} and this script's network") from None
-            for optimizer, state in zip(agent.optimizers, saved["optimizers"]):
-                optimizer.load_state_dict(state)
+                for optimizer, state in zip(agent.optimizers, saved["optimizers"], strict=True):
+                    optimizer.load_state_dict(state)
+            except (AttributeError, RuntimeError, ValueError):
+                what = f"{config.env_id} and this script's networks, optimizers and replay"
+                raise InputError(f"{config.resume} does not fit {what}") from None
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and own["random"].get("cuda") is not None:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
@@ -749,8 +751,13 @@ class Run:
     def _in_pool(self, function, large, name, seeds, *more):
         """Futures of `function(large, task, seed, *more)` in the pool's workers, for each of the seeds."""
         file = self.scratch / name  # sent through a queue, a large one would hang where a worker has died
-        file.write_bytes(pickle.dumps(large))
-        return [self.pool.submit(_in_worker, function, file, seed, *more) for seed in seeds]
+        try:
+            payload = pickle.dumps((function, large))
+        except Exception:  # at a fork's lambda, or class inside a function
+            with telling_task_errors("sending the policy to a worker"):
+                payload = cloudpickle.dumps((function, large))
+        file.write_bytes(payload)
+        return [self.pool.submit(_in_worker, file, seed, *more) for seed in seeds]
 
     def _film(self, clips, name, *more):
         return self._in_pool(film, clips, name, evaluation_seeds(self.config)[:1], self.directory / name, *more)[0]

@@ -149,10 +149,16 @@ def test_what_resume_and_evaluate_do_not_take(script, reference):
         assert "--resume takes a run's directory, --evaluate its policy.pt" in refusal(script, flag, reference / path)
 
 
-def test_a_network_that_was_changed_since(script, copy, tmp_path):
-    larger = {name: torch.stack((value, value)) for name, value in checkpoint(copy)["agent"].items()}
-    change(copy / "checkpoint.pt", agent=larger)
-    assert_one_line(Process(script, ["--resume", copy], tmp_path / "output"), 2, f"{copy} does not fit")
+def test_a_fork_that_was_changed_since(script, copy, monkeypatch):
+    """Its network is larger now, it has an optimizer more, or an optimizer's parameters have groups."""
+    module, saved = importlib.import_module(script), checkpoint(copy)
+    larger = {name: torch.stack((value, value)) for name, value in saved["agent"].items()}
+    first, *others = saved["optimizers"]
+    grouped = first | {"param_groups": 2 * first["param_groups"]}
+    for changes in ({"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]}):
+        torch.save(saved | changes, copy / "checkpoint.pt")
+        with pytest.raises(common.InputError, match=f"^{copy} does not fit"):
+            module.train(module.Config(resume=copy, num_iterations=320))
 
 
 def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
@@ -501,13 +507,14 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
     assert shlex.split(hint) == ["python", named, "--resume", "a run"]
 
 
-def test_the_hint_of_a_notebooks_cells(script, reference, monkeypatch):
-    """They have no file that a command could run."""
+def test_the_hint_of_a_program_that_calls_train(script, reference, monkeypatch):
+    """The script's own command would not know what the program registered or changed. A notebook's cells have none."""
     config = importlib.import_module(script).Config(resume=reference)
+    hint = f"to continue from the last checkpoint: train(Config(resume='{reference}'))"
+    assert common.Run(config, script, None, None)._how_to_continue() == hint
     monkeypatch.setattr(type(config), "__module__", "__main__")
     monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))
-    hint = common.Run(config, script, None, None)._how_to_continue()
-    assert hint == f"to continue from the last checkpoint: train(Config(resume='{reference}'))"
+    assert common.Run(config, script, None, None)._how_to_continue() == hint
 
 
 def test_dead_environment_worker(tmp_path):

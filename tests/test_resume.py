@@ -236,6 +236,27 @@ def test_what_a_fork_keeps(script, reference, tmp_path, monkeypatch):
     assert checkpoint(run)["step"] == 60
 
 
+def test_a_forks_network_that_pickle_does_not_know(script, reference, tmp_path, monkeypatch):
+    """A lambda in it is evaluated. What cannot be sent to a worker at all is told."""
+    module, config = importlib.import_module(script), json.loads((reference / "config.json").read_text())
+    init = module.Policy.__init__
+
+    def with_a_lambda(self, *more):
+        init(self, *more)
+        self.scale = lambda output: output
+
+    def with_a_parametrized_layer(self, *more):
+        init(self, *more)
+        self.layer = torch.nn.utils.parametrizations.weight_norm(torch.nn.Linear(1, 1))
+
+    monkeypatch.setattr(module.Policy, "__init__", with_a_lambda)
+    run = module.train(module.Config(**config | {"run_dir": tmp_path / "lambda", "num_iterations": 20}))
+    assert [row["step"] for row in read_csv(run / "eval.csv")] == [0, 20]
+    monkeypatch.setattr(module.Policy, "__init__", with_a_parametrized_layer)
+    with pytest.raises(common.TaskError, match="^sending the policy to a worker failed: Serialization of parametrized"):
+        module.train(module.Config(**config | {"run_dir": tmp_path / "parametrized", "num_iterations": 20}))
+
+
 def evaluate_in_numpy(policy, task, seed):
     return np.float64(seed), np.int64(1)
 
