@@ -476,10 +476,9 @@ def _in_worker(file, *arguments):
 def say(line):
     """Prints a line, above the progress bar. A program whose output nobody reads any more goes on."""
     try:
-        tqdm.write(line)
-        sys.stdout.flush()
-    except (AttributeError, ValueError):
-        pass  # there is no stream, or it is closed
+        with contextlib.suppress(AttributeError, ValueError):  # there is no stream, or it is closed
+            tqdm.write(line)
+            sys.stdout.flush()
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
@@ -637,9 +636,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        bar = self.writes and getattr(sys.stderr, "isatty", bool)()
-        self.progress = tqdm(total=config.num_iterations, initial=self.saved_step, unit="step", disable=not bar)
-        self.stack.enter_context(self.progress)
+        options = {"unit": "step", "disable": None if self.writes and sys.stderr else True}  # None: only on a terminal
+        self.progress = self.stack.enter_context(tqdm(total=config.num_iterations, initial=self.saved_step, **options))
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
@@ -672,7 +670,8 @@ class Run:
         self.stack.enter_context(contextlib.suppress(OSError))  # when the writer closes: the same full disk again
         self.summary_writer = self.stack.enter_context(SummaryWriter(self.directory))
         for table, rows in self.tables.items():
-            self._write_rows(table, rows)
+            if rows:
+                self._write_rows(table, rows)
         if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
             self._save("best_policy.pt", "policy", {"weights": weights})
 
@@ -684,17 +683,14 @@ class Run:
     def _write_rows(self, table, new):
         """Writes a table's file, which has all rows, and shows TensorBoard the `new` ones."""
         rows, text = self.tables[table], self.texts[table]
-        if new:
-            if added := [name for name in new[-1] if name not in rows[0]]:  # a fork's new metric
-                rows[0] |= dict.fromkeys(added, math.nan)
-                text.truncate(text.seek(0))
-            writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
-            if text.tell():
-                writer.writerows(new)
-            else:
-                writer.writeheader()
-                writer.writerows(rows)
-            self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+        if added := [name for name in new[-1] if name not in rows[0]]:  # a fork's new metric
+            rows[0] |= dict.fromkeys(added, math.nan)
+            text.truncate(text.seek(0))
+        writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
+        if not text.tell():
+            writer.writeheader()
+        writer.writerows(rows[text.getvalue().count("\n") - 1 :])  # those that the text lacks
+        self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after `_write`, which raises if another process continues this run
             for name, value in row.items():
                 if name != "step" and math.isfinite(value):
@@ -796,12 +792,10 @@ class Run:
         self._write(name, write)
 
     def _write(self, name, write):
-        try:
-            if (self.directory / ".owner").read_bytes() != self.owner:
-                raise FileNotFoundError
-            write_atomically(self.directory / name, write)
-        except FileNotFoundError:
-            raise RunError(f"another process continues the run in {self.path}, or it was removed") from None
+        with contextlib.suppress(FileNotFoundError):
+            if (self.directory / ".owner").read_bytes() == self.owner:
+                return write_atomically(self.directory / name, write)
+        raise RunError(f"another process continues the run in {self.path}, or it was removed")
 
     def finish(self, step, observation_space):
         """Saves and evaluates once more, draws the curve, exports and films the policy, and says where everything lies.

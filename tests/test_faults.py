@@ -564,7 +564,7 @@ def test_a_task_that_does_not_close_is_waited_for_until_a_deadline_or_a_second_i
     run = Process("sac_minitaur", arguments, tmp_path / "output", partial(never_close, factor=factor))
     wait_until((tmp_path / "run" / "train.csv").exists)
     run.kill(signal.SIGINT)
-    wait_until(lambda: "stopped at step" in run.stdout)
+    wait_until(lambda: "waiting for a worker" in run.stdout)
     if interrupts == 2:
         run.kill(signal.SIGINT)
     assert run.wait() == (130 if interrupts == 2 else 0) and "Traceback" not in run.stderr
@@ -574,7 +574,12 @@ def never_close(module, factor):
     """Once an episode has begun: gymnasium closes one environment before. Deadlines are multiplied by the factor."""
     common.SeededEpisodes.close = lambda env: time.sleep(10**6 * hasattr(env, "total"))
     join = BaseProcess.join
-    BaseProcess.join = lambda process, timeout=None: join(process, timeout and factor * timeout)
+
+    def tell_and_join(process, timeout=None):
+        print("waiting for a worker", flush=True)
+        join(process, timeout and factor * timeout)
+
+    BaseProcess.join = tell_and_join
 
 
 def test_a_second_interrupt_does_not_wait_for_a_task_that_is_being_made(tmp_path):
