@@ -263,7 +263,7 @@ def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, regi
     text = str(caught.value)
     assert caught.value.__cause__ is None  # which would show it a second time
     assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
-    assert ("--resume" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
+    assert ("Config(resume=" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
 
 
 def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeypatch, tmp_path):
