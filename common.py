@@ -10,7 +10,6 @@ import contextlib
 import copy
 import csv
 import ctypes
-import dataclasses
 import errno
 import gc
 import io
@@ -28,7 +27,6 @@ import traceback
 import warnings
 import zipfile
 import zlib
-from collections import deque
 from concurrent import futures
 from datetime import datetime
 from functools import partial
@@ -41,7 +39,6 @@ import numpy as np
 import torch
 import torch.distributed as dist
 import tyro
-from gymnasium.vector.utils import CloudpickleWrapper
 from pydantic import ConfigDict, Field
 from pydantic_core import ArgsKwargs, to_json, to_jsonable_python
 from tqdm import tqdm
@@ -221,7 +218,7 @@ class Ranks:
 
 
 def find_task(config, action_space):
-    """The gymnasium spec of --env-id with a time limit, and its observation and action spaces.
+    """The gymnasium spec of --env-id, with a time limit for evaluations to end, and its observation and action spaces.
 
     Worker processes make the task from the spec, because it may not be registered there. Raises InputError when it is
     unknown or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
@@ -229,19 +226,17 @@ def find_task(config, action_space):
     name = f"--env-id {config.env_id}"
     if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
         raise InputError(f"{name} is not the id of a task, as CartPole-v1 and my_module:MyTask-v0 are")
-    here = os.getcwd()
     try:
-        with gym.make(config.env_id, max_episode_steps=config.max_episode_steps) as env:
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.chdir, os.getcwd())  # a simulator may go to its own files
+            env = stack.enter_context(gym.make(config.env_id, max_episode_steps=config.max_episode_steps))
             observations, actions = env.observation_space, env.action_space
             # Not env.spec. It has the task's own wrappers, which gymnasium cannot always compare with new ones. It may
             # be the spec of another task that this one makes inside itself. And it is None where it cannot be copied.
-            task = gym.registry[env.unwrapped.spec.id]
-            limit = config.max_episode_steps or (env.spec or task).max_episode_steps
-            task = dataclasses.replace(task, max_episode_steps=limit or 10_000)  # or an evaluation might never end
+            task = copy.copy(gym.registry[env.unwrapped.spec.id])
+            task.max_episode_steps = config.max_episode_steps or (env.spec or task).max_episode_steps or 10_000
     except (gym.error.Error, ImportError) as error:
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
-    finally:
-        os.chdir(here)  # a simulator may go to its own files
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
     fits = isinstance(actions, action_space)
@@ -302,17 +297,20 @@ class SeededEpisodes(gym.Wrapper):
     the reset, it comes to the same state to the last bit. Arrays are copied: a task may change what it gave or got.
     """
 
-    def __init__(self, env, key, episode, actions):
-        super().__init__(env)
-        self.key, self.episode, self.actions = key, episode, list(actions)
+    def __init__(self, make_env, key, episode, actions):
+        if os.getpid() != Run.training_process:  # in a worker
+            start_worker()
+        with telling_task_errors():
+            super().__init__(make_env())
+        self.key, self.episode, self.actions = key, episode, list(np.asarray(actions))
         # Not the type of the task's own space: a task may return numbers that this type would cut.
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (math.prod(env.observation_space.shape),))
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (math.prod(self.env.observation_space.shape),))
 
     def reset(self, **_):
         replay, self.actions, self.total = self.actions, [], 0.0
         with telling_task_errors():
             observation, _ = self.env.reset(seed=derive_seed(*self.key, self.episode))
-            observation = self._checked(observation)
+            observation, _ = self._checked(observation, reward=0.0)
         for action in replay:
             observation, _, terminated, truncated, _ = self.step(action)
             if terminated or truncated:
@@ -322,24 +320,23 @@ class SeededEpisodes(gym.Wrapper):
     def step(self, action):
         with telling_task_errors():
             observation, reward, terminated, truncated, _ = self.env.step(copy.copy(action))
-            reward = float(reward)
-            observation = self._checked(observation, reward)
+            observation, reward = self._checked(observation, reward)
         self.actions.append(np.array(action))
         self.total += reward
         info = {}
         if terminated or truncated:
-            info = {"return": self.total, "length": len(self.actions)}
+            info = {"return and length": (self.total, len(self.actions))}
             self.episode, self.actions = self.episode + 1, []
         return observation, reward, bool(terminated), bool(truncated), info
 
-    def _checked(self, observation, reward=0.0):
-        """A flat copy of the observation, if it has its space's shape and is finite in float32, as is the reward."""
+    def _checked(self, observation, reward):
+        """A flat copy of the observation, if it has its space's shape, and the reward: both are finite in float32."""
         flat, shape = np.array(observation, np.float32), self.env.observation_space.shape
         if flat.shape != shape:
             raise ValueError(f"it returned an observation of shape {flat.shape}, but its space has {shape}")
         if not (np.isfinite(np.float32(reward)) and np.isfinite(flat).all()):
             raise ValueError(f"it returned the reward {reward} and the observation {flat}: not all finite")
-        return flat.ravel()
+        return flat.ravel(), float(reward)
 
 
 class Environments:
@@ -350,25 +347,17 @@ class Environments:
 
     def __init__(self, make_env, run, in_workers):
         """With `in_workers` each has a process of its own, so that `step_async` returns at once."""
-        seed, num_envs, rank, main = run.config.seed, run.config.num_envs, run.ranks.rank, os.getpid()
-        new = {"episodes": [(0, [])] * num_envs, "finished": []}
-        saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else new
+        seed, num_envs, rank = run.config.seed, run.config.num_envs, run.ranks.rank
+        saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else {}
         self.in_workers = in_workers
         self.steps, self.steps_at_once = run.checkpoint.get("env_steps", 0), num_envs * run.ranks.world_size
-        self.finished = deque(saved["finished"], maxlen=10)  # returns and lengths
-
-        def make(i, episode, actions):
-            if os.getpid() != main:
-                start_worker()
-            with telling_task_errors():
-                return SeededEpisodes(make_env(), (seed, rank * num_envs + i), episode, np.asarray(actions))
-
+        self.finished = saved.get("finished", [])  # returns and lengths
         # gymnasium would show a task's error once more for each process.
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
-        makers = [partial(make, i, *state) for i, state in enumerate(saved["episodes"])]
-        kind = gym.vector.SyncVectorEnv
-        if in_workers:  # no daemons, which could not start processes of their own
-            kind = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)
+        episodes = enumerate(saved.get("episodes", [(0, [])] * num_envs), rank * num_envs)
+        makers = [partial(SeededEpisodes, make_env, (seed, i), *episode) for i, episode in episodes]
+        workers = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)  # daemons start no processes
+        kind = workers if in_workers else gym.vector.SyncVectorEnv
         with run.killed_at_the_end(), contextlib.ExitStack() as making:
             if not in_workers and threading.current_thread() is threading.main_thread():
                 # What the task starts in this process ignores Ctrl-C.
@@ -394,7 +383,7 @@ class Environments:
         observations, self.observations = self.observations, next_observations.copy()
         for i in np.flatnonzero(terminated | truncated):
             next_observations[i] = infos["final_obs"][i]
-            self.finished.append((float(infos["final_info"]["return"][i]), int(infos["final_info"]["length"][i])))
+            self.finished = [*self.finished, infos["final_info"]["return and length"][i]][-10:]
         return observations, self.actions, rewards, terminated, next_observations
 
     def recent(self):
@@ -405,7 +394,7 @@ class Environments:
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
         episodes = list(zip(self.vector.get_attr("episode"), actions))
-        return {"episodes": episodes, "finished": list(self.finished), "fingerprint": self._fingerprint()}
+        return {"episodes": episodes, "finished": self.finished, "fingerprint": self._fingerprint()}
 
     def _fingerprint(self):
         """Tells where the running episodes stand: a checksum of their last observations and returns so far."""
@@ -554,7 +543,7 @@ class Run:
                 size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
                 context = multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
-                task = CloudpickleWrapper(self.task)
+                task = gym.vector.utils.CloudpickleWrapper(self.task)
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
                 with self.killed_at_the_end():
                     list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
@@ -592,8 +581,7 @@ class Run:
         file = Path(getattr(sys.modules.get(type(self.config).__module__), "__file__", "a notebook's cells"))
         if file.name != Path(sys.argv[0]).name:  # not this script runs, but a notebook or a program that calls `train`
             return f"to continue from the last checkpoint: train(Config(resume={str(self.path)!r}))"
-        program = file.name if os.path.exists(file.name) and file.samefile(file.name) else str(file)
-        return f"to continue from the last checkpoint: {python} {shlex.join([program, '--resume', str(self.path)])}"
+        return f"to continue from the last checkpoint: {python} {shlex.join([sys.argv[0], '--resume', str(self.path)])}"
 
     def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
@@ -687,9 +675,8 @@ class Run:
             rows[0] |= dict.fromkeys(added, math.nan)
             text.truncate(text.seek(0))
         writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
-        if not text.tell():
-            writer.writeheader()
-        writer.writerows(rows[text.getvalue().count("\n") - 1 :])  # those that the text lacks
+        header = dict(zip(rows[0], rows[0]))
+        writer.writerows([header, *rows][text.getvalue().count("\n") :])  # what the text lacks
         self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after `_write`, which raises if another process continues this run
             for name, value in row.items():
@@ -721,7 +708,7 @@ class Run:
         The best policy so far is saved. A stop request ends this early; the resumed run does it again.
         """
         table = "eval" if policy else "random"
-        if not self.writes or any(row["step"] == step for row in self.tables[table][-1:]):
+        if not self.writes or self.stopped or any(row["step"] == step for row in self.tables[table][-1:]):
             return
         policy = policy and copy.deepcopy(policy).cpu().eval()  # a fork may have dropout
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", evaluation_seeds(self.config))
@@ -804,8 +791,7 @@ class Run:
         """
         if step > self.saved_step or self.stopped:
             self.save(step)
-        if not self.stopped:
-            self.evaluate(step, self.agent.policy)
+        self.evaluate(step, self.agent.policy)
         if not self.writes:
             return
         self.progress.close()
@@ -921,8 +907,7 @@ def film(clips, task, seed, path, seconds=math.inf, max_fps=50):
 
     def frame(caption):
         image = Image.fromarray(env.render())
-        if caption:
-            ImageDraw.Draw(image).text((8, 8), caption, "black", font_size=20, stroke_width=2, stroke_fill="white")
+        ImageDraw.Draw(image).text((8, 8), caption or "", "black", font_size=20, stroke_width=2, stroke_fill="white")
         return np.asarray(image)
 
     def write(file):

@@ -316,7 +316,7 @@ def train(config):
             buffer.add(*envs.step_wait())
             if envs.steps >= config.initial_collect_steps:
                 agent.fit_scaling(*buffer.observations_and_rewards())
-        while step < config.num_iterations and not run.stopped:  # stop_requested sets run.stopped
+        while step < config.num_iterations:
             if step % config.eval_interval == 0:
                 run.evaluate(step, agent.policy)
             if run.stop_requested(step):

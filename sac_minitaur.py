@@ -445,7 +445,7 @@ def train(config):
             buffer.add(*envs.step_wait())
             if envs.steps >= config.initial_collect_steps:
                 agent.fit_reward_scale(buffer.rewards())
-        while step < config.num_iterations and not run.stopped:  # stop_requested sets run.stopped
+        while step < config.num_iterations:
             if step % config.eval_interval == 0:
                 run.evaluate(step, agent.policy)
             if run.stop_requested(step):

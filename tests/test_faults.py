@@ -503,8 +503,7 @@ def test_a_fork_of_the_script_in_a_notebooks_environment(program, tmp_path):
     assert process.returncode == 0 and "warning" not in output
     assert (here / "a run" / "learning_curve.png").stat().st_size > 0
     hint = output.splitlines()[-1].partition("checkpoint: ")[2]
-    named = program if program == "my dqn.py" else f"{here}/{program}"
-    assert shlex.split(hint) == ["python", named, "--resume", "a run"]
+    assert shlex.split(hint) == ["python", program, "--resume", "a run"]
 
 
 def test_the_hint_of_a_program_that_calls_train(script, reference, monkeypatch):

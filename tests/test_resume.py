@@ -310,7 +310,7 @@ def hang_up_in_an_evaluation(module, step):
     evaluate = common.Run.evaluate
 
     def evaluate_slowly(run, at, policy):
-        if at == step:
+        if at == step and not run.stopping:
             run.evaluate_episode, common.evaluation_seeds = play_for_ever, lambda config: range(20)
             threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGHUP)).start()
         return evaluate(run, at, policy)
