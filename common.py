@@ -331,12 +331,12 @@ class SeededEpisodes(gym.Wrapper):
 
     def _checked(self, observation, reward):
         """A flat copy of the observation, if it has its space's shape, and the reward: both are finite in float32."""
-        flat, shape = np.array(observation, np.float32), self.env.observation_space.shape
+        reward, flat, shape = float(reward), np.array(observation, np.float32), self.env.observation_space.shape
         if flat.shape != shape:
             raise ValueError(f"it returned an observation of shape {flat.shape}, but its space has {shape}")
         if not (np.isfinite(np.float32(reward)) and np.isfinite(flat).all()):
             raise ValueError(f"it returned the reward {reward} and the observation {flat}: not all finite")
-        return flat.ravel(), float(reward)
+        return flat.ravel(), reward
 
 
 class Environments:
