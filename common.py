@@ -87,7 +87,6 @@ def run_main(main):
 
 
 def first_line(error):
-    """The first line of an error's message."""
     return (str(error).splitlines() or [type(error).__name__])[0][:200]
 
 
@@ -153,14 +152,11 @@ def select_device(name, local_rank=0):
 
 
 def keep_freed_memory():
-    """Tells glibc to keep what is freed (mallopt's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD).
-
-    Every update frees and allocates the same tensors. Without this each would be mapped in afresh, page by page.
-    """
+    """Tells glibc to keep what is freed. Otherwise every update would map its tensors in afresh, page by page."""
     with contextlib.suppress(OSError, AttributeError):  # no glibc
         libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 32 << 20)  # the most that glibc before 2.35 takes
-        libc.mallopt(-1, 256 << 20)
+        libc.mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD, the most that glibc before 2.35 takes
+        libc.mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD
 
 
 def empty_replay(capacity, columns, device):
