@@ -672,7 +672,7 @@ class Run:
             text.truncate(text.seek(0))
         writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
         header = dict(zip(rows[0], rows[0]))
-        writer.writerows([header, *rows][text.getvalue().count("\n") :])  # what the text lacks
+        writer.writerows(new if text.tell() else [header, *rows])
         self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after `_write`, which raises if another process continues this run
             for name, value in row.items():
@@ -903,7 +903,8 @@ def film(clips, task, seed, path, seconds=math.inf, max_fps=50):
 
     def frame(caption):
         image = Image.fromarray(env.render())
-        ImageDraw.Draw(image).text((8, 8), caption or "", "black", font_size=20, stroke_width=2, stroke_fill="white")
+        if caption:
+            ImageDraw.Draw(image).text((8, 8), caption, "black", font_size=20, stroke_width=2, stroke_fill="white")
         return np.asarray(image)
 
     def write(file):

@@ -149,16 +149,16 @@ def test_what_resume_and_evaluate_do_not_take(script, reference):
         assert "--resume takes a run's directory, --evaluate its policy.pt" in refusal(script, flag, reference / path)
 
 
-def test_a_fork_that_was_changed_since(script, copy, monkeypatch):
+def test_a_fork_that_was_changed_since(script, copy, tmp_path):
     """Its network is larger now, it has an optimizer more, or an optimizer's parameters have groups."""
-    module, saved = importlib.import_module(script), checkpoint(copy)
+    saved = checkpoint(copy)
     larger = {name: torch.stack((value, value)) for name, value in saved["agent"].items()}
     first, *others = saved["optimizers"]
     grouped = first | {"param_groups": 2 * first["param_groups"]}
-    for changes in ({"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]}):
-        torch.save(saved | changes, copy / "checkpoint.pt")
-        with pytest.raises(common.InputError, match=f"^{copy} does not fit"):
-            module.train(module.Config(resume=copy, num_iterations=320))
+    for number, values in enumerate(({"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]})):
+        change(copy / "checkpoint.pt", **saved | values)
+        run = Process(script, ["--resume", copy], tmp_path / f"output {number}")
+        assert_one_line(run, 2, f"{copy} does not fit")
 
 
 def test_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
