@@ -108,7 +108,7 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds over 200 times the largest observation (N, O), which would come near 0. CartPole has none."""
+        """Drops bounds over 200 times the largest observation: scaled by them, all (N, O) would be near 0."""
         largest = observations.abs().amax(0)
         ranks.average([largest])  # in place, over the processes
         beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # always 0 (a black pixel) counts as 1
@@ -200,7 +200,7 @@ def td_targets(rewards, terminated, next_q, gamma):
 
 
 def gap_to_best(q, actions):
-    """max Q(s, ·) − Q(s, a), minus the advantage of a: (B,), for q (B, A) and actions (B,). See arXiv:1512.04860."""
+    """max Q(s, ·) − Q(s, a), how much worse a is than the best: (B,), for q (B, A), actions (B,). arXiv:1512.04860."""
     return q.amax(1) - q.gather(1, actions[:, None]).squeeze(1)
 
 
@@ -303,14 +303,14 @@ def train(config):
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
         batch_size = run.ranks.batch_share(config)  # this process's share
-        # The environments step here, in step_wait: a message to a worker takes longer than a step of CartPole.
+        # They reset themselves. They step in this process: a message to a worker takes longer than a step of CartPole.
         envs = common.Environments(partial(gym.make, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
         agent = DQNAgent(config, observation_space, action_space, run.device, run.ranks)
         buffer = ReplayBuffer(config.replay_buffer_capacity, envs.observations.shape[1], run.device)
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
-        # Random actions first. After the last, fit the scales: here, because a resumed run must not fit again.
+        # Random actions first. After the last, fit the scales: in this loop, which a resumed run skips.
         while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())

@@ -7,12 +7,12 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor π samples its actions; two critics estimate their value Q. The actor learns to make Q + α × entropy large: it
-earns much but stays random, and so it explores. The entropy is the mean of −log π(a|s). α is tuned until the entropy
-has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as
-in dqn_cartpole.py. The minimum is over the two critics, not over actions. The actor uses it, too: an actor that
-maximizes one estimate exploits its errors. In the paper slow copies of the critics, the target critics, compute y.
-By default batch normalization replaces them.
+The actor π samples its actions; two critics estimate their value Q, later entropies included. The actor learns to
+make Q + α × entropy large: it earns much but stays random, and so it explores. The entropy is the mean of −log π(a|s).
+α is tuned until the entropy has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with
+a' ~ π(·|s'), and r, γ and s' as in dqn_cartpole.py. The minimum is over the two critics, not over actions. The actor
+uses it, too: an actor that maximizes one estimate exploits its errors. In the paper slow copies of the critics, the
+target critics, compute y. By default batch normalization replaces them.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -54,7 +54,7 @@ class Config:
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
     adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but there not for α
-    privileged_critics: bool = True  # ours (theirs: no): critics see the robot's speed and height (arXiv:1710.06542)
+    privileged_critics: bool = True  # ours (theirs: no): critics see speed, turning and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
     gamma: common.Fraction = 0.99  # discount
@@ -71,7 +71,7 @@ class Config:
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
     num_threads: common.Parallel = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
-    cuda_graph: bool = False  # on a GPU: record the update and replay it, about twice as fast: see `cuda_graph`
+    cuda_graph: bool = False  # on a GPU: record the update once and repeat it, about twice as fast: see `cuda_graph`
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     resume: Path | None = None  # directory of a run to continue from its last checkpoint
     evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
@@ -147,7 +147,7 @@ class TwinCritics(nn.Module):
         self.q2 = mlp(state_size + action_size, hidden_layers, 1, batch_norm)
 
     def forward(self, state, action):
-        """(2, …) for states (…, S) and actions (…, A)."""
+        """(2, B) for states (B, S) and actions (B, A)."""
         x = torch.cat((state, action), dim=-1)
         return torch.stack((self.q1(x), self.q2(x))).squeeze(-1)
 
@@ -235,7 +235,7 @@ def critic_loss(q, targets, weight):
 
 
 def actor_loss(log_probs, q, alpha):
-    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). Equation 7."""
+    """The mean of α log π(a|s) − min over the twins of Q(s, a): log_probs (B,), q (2, B). The paper's equation 7."""
     return (alpha * log_probs - q.amin(0)).mean()
 
 
@@ -273,7 +273,7 @@ class SACAgent(nn.Module):
         actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
         alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
         self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # `update` adds up their losses
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # for the checkpoint; add a scheduler here
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # saved; add a scheduler here
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
@@ -362,11 +362,11 @@ def soft_update(target, source, tau):
 
 
 def cuda_graph(agent):
-    """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, and every later call replays that.
+    """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, which this and later calls replay.
 
     Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. But a
-    replay runs no Python: what Python reads, computes or decides in `update` stays as recorded. Raises InputError
-    where there is no GPU, or more than one process.
+    replay runs no Python: what Python reads, computes or decides in `update`, as a scheduler does, stays as recorded.
+    Raises InputError where there is no GPU, or more than one process.
     """
     if agent.device.type != "cuda" or agent.ranks.world_size > 1:
         raise common.InputError("--cuda-graph is for one process with a CUDA GPU: use --no-cuda-graph")
@@ -388,7 +388,7 @@ def cuda_graph(agent):
         for graph_input, values in zip(recorded, batch):
             graph_input.copy_(values)  # a replay reads its batch from the recorded tensors
         graph.replay()
-        return metrics
+        return metrics  # the next replay overwrites them
 
     return update
 
@@ -409,7 +409,7 @@ def evaluate(policy, task, seed):
 def make_training_env(task, privileged):
     """The task with actions in [-1, 1], as the agent sees it in training.
 
-    With `privileged`, what only the critics see, (S − O,), follows the observation (O,), if the environment has it.
+    With `privileged`, the environment's `privileged_observation` (S − O,), if it has one, follows the observation (O,).
     """
     env = gym.make(task)
     low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
@@ -439,7 +439,7 @@ def train(config):
         update = cuda_graph(agent) if config.cuda_graph else agent.update
         torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
         step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
-        # Random actions first. After the last, fit the reward scale: here, because a resumed run must not fit again.
+        # Random actions first. After the last, fit the reward scale: in this loop, which a resumed run skips.
         while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
             envs.step_async(agent.random_actions(config.num_envs))
             buffer.add(*envs.step_wait())
@@ -617,18 +617,18 @@ class MinitaurBulletEnv(gym.Env):
 
     @staticmethod
     def _motor_angles(action):
-        """The angles in rad that the eight motors are to reach, from the leg model's swing and extension.
+        """The angles in rad that the eight motors are to reach: extension turns a leg's two alike, swing oppositely.
 
         In the action's own precision and in this order: with float32 actions the original computes in float32 too.
         """
         swing, extension = np.repeat(action[:4], 2), np.repeat(action[4:], 2)
-        quarter = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)
-        return math.pi + -math.pi / 4 * (extension + 1.5) + quarter * swing  # 1.5: pybullet's offset_for_singularity
+        per_swing = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)  # rad
+        return math.pi + -math.pi / 4 * (extension + 1.5) + per_swing * swing  # 1.5: pybullet's offset_for_singularity
 
     def _substep(self, command):
         """Drives the motors towards the angles `command` for 0.002 s, in the order of pybullet's motor.py."""
         simulator, dynamics = self.simulator, self.dynamics
-        pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)
+        pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)  # share of the voltage
         drive = pwm * dynamics.voltage
         # The robot observes a torque without back-EMF and the iron's saturation. The torque that moves it has both.
         limit = self.MAX_OBSERVED_TORQUE
