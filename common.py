@@ -640,11 +640,10 @@ class Run:
             self.directory.mkdir(parents=True, exist_ok=True)
             if self.config.resume is None:
                 if any(self.directory.iterdir()):
-                    raise FileExistsError(0, "not empty: name a new one, or continue it with --resume")
+                    raise ValueError("not empty: name a new one, or continue it with --resume")
                 (self.directory / "config.json").touch(exist_ok=False)  # fails for the second of two at once
         except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", error)
-            raise InputError(f"--run-dir {self.path} cannot be used: {why}") from None
+            raise InputError(f"--run-dir {self.path} cannot be used: {first_line(error)}") from None
         text = to_json(plain_config(self.config), indent=2) + b"\n"
         write_atomically(self.directory / "config.json", lambda file: file.write(text))
         write_atomically(self.directory / ".owner", lambda file: file.write(self.owner))
