@@ -235,12 +235,11 @@ def find_task(config, action_space):
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
-    fits = isinstance(actions, action_space)
     if action_space is gym.spaces.Discrete:
-        needed, fits = "Discrete from 0", fits and actions.start == 0
+        needed, fits = "Discrete from 0", isinstance(actions, action_space) and actions.start == 0
     else:
         needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        fits = fits and actions.dtype in (np.float16, np.float32, np.float64)
+        fits = isinstance(actions, action_space) and actions.dtype in (np.float16, np.float32, np.float64)
         if fits:  # in float32, as the agent computes
             widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()
             fits = actions.shape and widths.numel() and (widths.isfinite() & (widths > 0)).all()
