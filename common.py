@@ -318,9 +318,8 @@ class SeededEpisodes(gym.Wrapper):
             observation, reward = self._checked(observation, reward)
         self.actions.append(np.array(action))
         self.total += reward
-        info = {}
+        info = {"return and length": (self.total, len(self.actions))}  # so far
         if terminated or truncated:
-            info = {"return and length": (self.total, len(self.actions))}
             self.episode, self.actions = self.episode + 1, []
         return observation, reward, bool(terminated), bool(truncated), info
 
