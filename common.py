@@ -336,11 +336,10 @@ class SeededEpisodes(gym.Wrapper):
 class Environments:
     """K environments of one task, stepped together; `observations` (K, O), flat, are those to act on (SAC: (K, S)).
 
-    `steps` counts the steps of all, over all processes.
+    `steps` counts the steps of all, over all processes. With `in_workers` each environment has a process of its own.
     """
 
     def __init__(self, make_env, run, in_workers):
-        """With `in_workers` each has a process of its own, so that `step_async` returns at once."""
         seed, num_envs, rank = run.config.seed, run.config.num_envs, run.ranks.rank
         saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else {}
         self.in_workers = in_workers
