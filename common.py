@@ -195,15 +195,6 @@ class Ranks:
                 raise InputError(f"{what}; start them with torchrun, or unset RANK") from None
             self.rank, self.world_size = dist.get_rank(), dist.get_world_size()
 
-    def batch_share(self, config):
-        """This process's share of the batch size. Raises InputError for unequal ones, or for more than is stored."""
-        if config.batch_size % self.world_size:
-            raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
-        own = min(config.initial_collect_steps // self.world_size, config.replay_buffer_capacity)
-        if config.batch_size > (stored := own * self.world_size):
-            raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions stored at first")
-        return config.batch_size // self.world_size
-
     def average(self, tensors):
         """Replaces each tensor by its mean over the ranks, in one collective for all of them."""
         if self.world_size > 1:
@@ -493,6 +484,13 @@ class Run:
         if config.resume is not None:
             self.checkpoint = read_file(config.resume / "checkpoint.pt", "checkpoint", script)
             self._require_same_run(self.checkpoint["config"])
+        processes = self.ranks.world_size
+        if config.batch_size % processes:
+            raise InputError(f"--batch-size {config.batch_size} cannot be shared by {processes} processes")
+        stored = processes * min(config.initial_collect_steps // processes, config.replay_buffer_capacity)
+        if config.batch_size > stored:
+            raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions stored at first")
+        self.batch_size = config.batch_size // processes  # this process's share
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
         path = [config.resume or config.run_dir or Path("runs") / name]
         if self.ranks.world_size > 1:

@@ -302,7 +302,6 @@ def train(config):
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
     with common.Run(config, "dqn_cartpole", task, evaluate) as run:
-        batch_size = run.ranks.batch_share(config)  # this process's share
         # They reset themselves. They step in this process: a message to a worker takes longer than a step of CartPole.
         envs = common.Environments(partial(gym.make, task), run, in_workers=False)
         torch.manual_seed(config.seed)  # the same networks on every rank
@@ -328,7 +327,7 @@ def train(config):
                 envs.step_async(agent.act(envs.observations))
                 buffer.add(*envs.step_wait())
             if envs.steps >= due:
-                metrics = agent.update(buffer.sample(batch_size), step)
+                metrics = agent.update(buffer.sample(run.batch_size), step)
                 step += 1
                 run.log_training(step, metrics)  # a row every log_interval updates
             if step - run.saved_step >= config.checkpoint_interval:

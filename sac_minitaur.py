@@ -430,7 +430,6 @@ def train(config):
     """
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
     with common.Run(config, "sac_minitaur", task, evaluate) as run:
-        batch_size = run.ranks.batch_share(config)  # this process's share
         envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
         torch.manual_seed(config.seed)  # the same networks on every rank
         _, state_size = envs.observations.shape  # S, with the privileged numbers
@@ -458,7 +457,7 @@ def train(config):
             if collecting:
                 envs.step_async(agent.act(envs.observations))
             if envs.steps >= due:  # step_async has counted the new steps
-                metrics = update(buffer.sample(batch_size))
+                metrics = update(buffer.sample(run.batch_size))
                 step += 1
                 run.log_training(step, metrics)  # a row every log_interval updates
             if collecting:

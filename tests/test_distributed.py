@@ -66,7 +66,7 @@ def save_gradients(module, directory):
     """Makes the gradients of both scripts' agents the run, and the directory that it would have."""
 
     def main():
-        run = common.Run(module.Config(device="cpu"), module.__name__, None, None)
+        run = common.Run(module.Config(device="cpu", batch_size=24), module.__name__, None, None)
         found = {name: gradients_of_update(sys.modules[name], run.ranks) for name in SCRIPTS}
         torch.save(found | {"path": str(run.path)}, f"{directory}/{run.ranks.rank}.pt")
 
