@@ -327,7 +327,7 @@ def train(config):
                 envs.step_async(agent.act(envs.observations))
                 buffer.add(*envs.step_wait())
             if envs.steps >= due:
-                metrics = agent.update(buffer.sample(run.batch_size), step)
+                metrics = agent.update(buffer.sample(run.batch_size), step)  # this process's share of the batch
                 step += 1
                 run.log_training(step, metrics)  # a row every log_interval updates
             if step - run.saved_step >= config.checkpoint_interval:

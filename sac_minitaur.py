@@ -457,7 +457,7 @@ def train(config):
             if collecting:
                 envs.step_async(agent.act(envs.observations))
             if envs.steps >= due:  # step_async has counted the new steps
-                metrics = update(buffer.sample(run.batch_size))
+                metrics = update(buffer.sample(run.batch_size))  # this process's share of the batch
                 step += 1
                 run.log_training(step, metrics)  # a row every log_interval updates
             if collecting:
