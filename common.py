@@ -335,7 +335,7 @@ class Environments:
         saved = run.checkpoint["ranks"][rank]["environments"] if run.checkpoint else {}
         self.in_workers = in_workers
         self.steps, self.steps_at_once = run.checkpoint.get("env_steps", 0), num_envs * run.ranks.world_size
-        self.finished = saved.get("finished", [])  # returns and lengths
+        self.finished = saved.get("finished", [])  # returns and lengths of the last 10 episodes that ended
         # gymnasium would show a task's error once more for each process.
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         episodes = enumerate(saved.get("episodes", [(0, [])] * num_envs), rank * num_envs)
@@ -369,11 +369,6 @@ class Environments:
             next_observations[i] = infos["final_obs"][i]
             self.finished = [*self.finished, infos["final_info"]["return and length"][i]][-10:]
         return observations, self.actions, rewards, terminated, next_observations
-
-    def recent(self):
-        """The mean return and length of the last 10 episodes that ended (nan before the first)."""
-        returns, lengths = zip(*self.finished) if self.finished else ([math.nan], [math.nan])
-        return {"collect_return": float(np.mean(returns)), "collect_episode_length": float(np.mean(lengths))}
 
     def state_dict(self):
         actions = [torch.from_numpy(np.array(each)) for each in self.vector.get_attr("actions")]
@@ -688,7 +683,9 @@ class Run:
                 raise RunError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
         now, (then, last_step) = time.perf_counter(), self.last_logged
         self.last_logged, speed = (now, step), (step - last_step) / (now - then)
-        self._log("train", step, {"steps_per_second": speed} | self.environments.recent() | values)
+        returns, lengths = zip(*self.environments.finished or [(math.nan, math.nan)])
+        episodes = {"collect_return": float(np.mean(returns)), "collect_episode_length": float(np.mean(lengths))}
+        self._log("train", step, {"steps_per_second": speed} | episodes | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
         self.print(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
