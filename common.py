@@ -342,7 +342,8 @@ class Environments:
         makers = [partial(SeededEpisodes, make_env, (seed, i), *episode) for i, episode in episodes]
         workers = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)  # daemons start no processes
         kind = workers if in_workers else gym.vector.SyncVectorEnv
-        with run.killed_at_the_end(), contextlib.ExitStack() as making:
+        with contextlib.ExitStack() as making:
+            making.callback(run.kill_at_the_end, multiprocessing.active_children())
             if not in_workers and threading.current_thread() is threading.main_thread():
                 # What the task starts in this process ignores Ctrl-C.
                 making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
@@ -531,7 +532,8 @@ class Run:
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 task = gym.vector.utils.CloudpickleWrapper(self.task)
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
-                with self.killed_at_the_end():
+                with contextlib.ExitStack() as starting:
+                    starting.callback(self.kill_at_the_end, multiprocessing.active_children())
                     list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
@@ -539,15 +541,10 @@ class Run:
             failing.pop_all()
         return self
 
-    @contextlib.contextmanager
-    def killed_at_the_end(self):
-        """The processes that start inside end with the run, whatever they do."""
-        others = multiprocessing.active_children()
-        try:
-            yield
-        finally:
-            for worker in set(multiprocessing.active_children()).difference(others):
-                self.stack.callback(worker.kill)
+    def kill_at_the_end(self, others):
+        """Lets this process's children, all but `others`, end with the run, whatever they do."""
+        for worker in set(multiprocessing.active_children()).difference(others):
+            self.stack.callback(worker.kill)
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
