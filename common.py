@@ -600,7 +600,7 @@ class Run:
                 for optimizer, state in zip(agent.optimizers, saved["optimizers"], strict=True):
                     optimizer.load_state_dict(state)
             except (AttributeError, RuntimeError, ValueError):
-                raise InputError(f"{config.resume} does not fit this task, networks, optimizers and replay") from None
+                raise InputError(f"{config.resume} does not fit this script's networks, optimizers, replay") from None
             torch.set_rng_state(own["random"]["cpu"])
             if self.device.type == "cuda" and own["random"].get("cuda") is not None:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
