@@ -108,11 +108,13 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds over 200 times the largest observation: scaled by them, all (N, O) would be near 0."""
-        largest = observations.abs().amax(0)
-        ranks.average([largest])  # in place, over the processes
-        beyond = self.half_range > 200 * torch.where(largest > 0, largest, 1.0)  # always 0 (a black pixel) counts as 1
-        self.center[beyond], self.half_range[beyond] = 0.0, 1.0
+        """Drops bounds over 130 times wider than the observations (N, O), which would all come near one number."""
+        low, high = observations.amin(0), observations.amax(0)
+        ranks.average([low, high])  # in place, over the processes
+        half_range = (high - low) / 2
+        beyond = self.half_range > 130 * torch.where(half_range > 0, half_range, 1.0)  # a constant one (a pixel): 1
+        self.center.copy_(torch.where(beyond, low + half_range, self.center))
+        self.half_range.copy_(torch.where(beyond, half_range.clamp(min=1), self.half_range))
 
     def forward(self, observation):
         return (observation - self.center) / self.half_range

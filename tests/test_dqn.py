@@ -55,11 +55,13 @@ def test_scaling_maps_bounds_to_one():
     observations = torch.tensor([[2.0, -4, 3, 3, 3, 5], [6, 4, -7, -7, -7, 5], [4, 1, 0, 0, 0, 5]])
     scaled = [[-1.0, -1, 3, 3, 3, 5], [1, 1, -7, -7, -7, 5], [0, 0.25, 0, 0, 0, 5]]
     assert scaling(observations).tolist() == scaled
-    # Bounds that nobody reaches are none, on one side too. Those within two hundred times of the data, or of 1, are.
-    low, high = np.float32([-62, -20, 0, 0, -1e6]), np.float32([62, 20, 1e4, 255, 1e6])
+    # Bounds that nobody reaches are none, on one side too, wherever the data lie. Those within 130 times of these are.
+    low, high = np.float32([-35, -30, 0, 0, -1e6, -1000, -1e6]), np.float32([35, 30, 1e4, 255, 1e6, 2000, 1e6])
     scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(low, high))
-    scaling.fit(torch.tensor([[0.3, 0.1, 5, 0, 0], [-0.1, -0.2, 0, 0, 0]]), common.Ranks())
-    assert scaling(torch.tensor([2.0, 10, 5, 255, 3])).tolist() == [2.0, 0.5, 5, 1, 3]
+    data = torch.tensor([[0.25, 0.25, 5, 0, 0, 1000.5, 300], [-0.25, -0.25, 0, 0, 0, 999.5, -300]])
+    scaling.fit(data - torch.tensor([0.05, 0, 0, 0, 0, 0, 0]), common.Ranks())
+    scaled = scaling(torch.tensor([2.0, 15, 5, 255, 3, 1002, 600])).tolist()
+    assert scaled == pytest.approx([2.05, 0.5, 1, 1, 3, 2, 2])
     for dtype in (np.uint8, np.longdouble, ">f4"):
         assert dqn_cartpole.ObservationScaling(gym.spaces.Box(0, 1, (2,), dtype)).center.tolist() == [0.5, 0.5]
     unscaled = make_agent(observation_scaling=False)
