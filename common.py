@@ -81,13 +81,20 @@ def run_main(main):
         status = 2 if isinstance(error, InputError) else 1
     except KeyboardInterrupt:
         status = 130
+    except BrokenPipeError:  # `--help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes it at the end
+        status = 1
     if dist.is_initialized():
         os._exit(status)  # the others are not waited for: they may be gone
     sys.exit(status)
 
 
 def first_line(error):
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+    try:
+        text = str(error).strip()
+    except Exception:  # of a task's own error
+        text = ""
+    return (text or type(error).__name__).splitlines()[0][:200]
 
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
@@ -222,7 +229,11 @@ def find_task(config, action_space):
             # be the spec of another task that this one makes inside itself. And it is None where it cannot be copied.
             task = copy.copy(gym.registry[env.unwrapped.spec.id])
             task.max_episode_steps = config.max_episode_steps or (env.spec or task).max_episode_steps or 10_000
-    except (gym.error.Error, ImportError) as error:
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)[1:]
+        in_task = any(not frame.filename.startswith(gym.__path__[0]) for frame in frames)
+        if in_task and not isinstance(error, (gym.error.Error, ImportError)):
+            raise  # with its traceback. What gymnasium itself raises, as for a misspelt entry point, is one line.
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed")
@@ -544,7 +555,8 @@ class Run:
     def kill_at_the_end(self, others):
         """Lets this process's children, all but `others`, end with the run, whatever they do."""
         for worker in set(multiprocessing.active_children()).difference(others):
-            self.stack.callback(worker.kill)
+            if not worker.daemon:  # Python ends these; a killed one may hold a lock that Python then waits for
+                self.stack.callback(worker.kill)
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
@@ -606,7 +618,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        options = {"unit": "step", "disable": None if self.writes and sys.stderr else True}  # None: only on a terminal
+        no_stderr = getattr(sys.stderr, "closed", not sys.stderr)
+        options = {"unit": "step", "disable": not self.writes or no_stderr or None}  # None: only on a terminal
         self.progress = self.stack.enter_context(tqdm(total=config.num_iterations, initial=self.saved_step, **options))
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
@@ -839,7 +852,8 @@ def evaluate_policy(config, script, policy, task, evaluate):
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
     torch.set_num_threads(1)  # as in a run's evaluation: the same digits
     seeds, video = evaluation_seeds(config), config.evaluate.with_suffix(".mp4").absolute()
-    _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
+    bar = tqdm(seeds, disable=getattr(sys.stderr, "closed", not sys.stderr) or None)  # None: only on a terminal
+    _, text = summarize([evaluate(policy, task, seed) for seed in bar])
     try:
         say(f"{config.evaluate}: {text}")
         if config.video:

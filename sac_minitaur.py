@@ -159,8 +159,12 @@ class Policy(nn.Module):
         super().__init__()
         self.action_space = action_space
         self.actor = Actor(math.prod(observation_space.shape), math.prod(action_space.shape), config.actor_layers)
-        self.register_buffer("low", torch.tensor(action_space.low, dtype=torch.float32))  # a copy: loading writes to it
-        self.register_buffer("high", torch.tensor(action_space.high, dtype=torch.float32))
+        low, high = np.float32(action_space.low), np.float32(action_space.high)
+        # A float64 bound may lie between two float32 numbers: take the inner one.
+        low = np.where(low < action_space.low, np.nextafter(low, high), low)
+        high = np.where(high > action_space.high, np.nextafter(high, low), high)
+        self.register_buffer("low", torch.tensor(low))  # a copy: loading a policy writes to it
+        self.register_buffer("high", torch.tensor(high))
 
     def forward(self, observation):
         """Actions (batch, *action shape) for observations (batch, *observation shape)."""

@@ -331,8 +331,10 @@ def test_a_process_that_a_task_forks_can_be_ended_at_once():
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-def test_what_a_task_forks_and_does_not_end_ends_with_the_run():
-    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+@pytest.mark.parametrize("daemon", [False, True])
+def test_what_a_task_forks_and_does_not_end_ends_with_the_run(daemon):
+    """A daemon, as a Pool's worker is, ends with the program: killed, it may hold a lock that Python waits for."""
+    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,), daemon=daemon)
 
     def make():
         process.start()
@@ -341,8 +343,9 @@ def test_what_a_task_forks_and_does_not_end_ends_with_the_run():
     with new_run() as run:
         common.Environments(make, run, in_workers=False)
         assert process.is_alive()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
+    process.join(0.5 if daemon else None)
+    assert process.exitcode == (None if daemon else -signal.SIGKILL)
+    process.kill()
 
 
 @pytest.mark.parametrize(
@@ -420,6 +423,10 @@ def close_the_stream(module):
     before_update(module, 50, sys.stdout.close)
 
 
+def close_stderr(module):
+    before_call(common, "find_task", 1, sys.stderr.close)
+
+
 def replace_stderr(module):
     sys.stderr = SimpleNamespace(write=len, flush=lambda: None)
 
@@ -437,7 +444,10 @@ def ignore_hangup(module):
     before_update(module, 50, lambda: os.kill(os.getpid(), signal.SIGHUP))
 
 
-@pytest.mark.parametrize("hook", [lose_the_reader, close_the_stream, replace_stderr, have_no_streams, ignore_hangup])
+HOOKS = [lose_the_reader, close_the_stream, close_stderr, replace_stderr, have_no_streams, ignore_hangup]
+
+
+@pytest.mark.parametrize("hook", HOOKS)
 def test_trains_on_without_a_console(tmp_path, hook):
     run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hook)
     assert not run.stderr and checkpoint(tmp_path / "run")["step"] == 300
@@ -475,6 +485,8 @@ def test_the_command_from_a_shell(script):
     result = subprocess.run([*command, "--help"], env=environ, capture_output=True)
     assert result.returncode == 0 and not result.stderr, result.stderr
     assert b"--num-iterations" in result.stdout and b"ours (theirs" in result.stdout
+    unread = shlex.join(map(str, [*command, "--help"])) + " | true"
+    assert not subprocess.run(unread, shell=True, capture_output=True).stderr
     result = subprocess.run([*command, "--env-id", "NoSuchTask-v0"], capture_output=True, text=True)
     assert result.returncode == 2 and not result.stdout
     assert result.stderr.startswith("error: --env-id NoSuchTask-v0") and result.stderr.count("\n") == 1

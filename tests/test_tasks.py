@@ -88,6 +88,13 @@ class Helped(gym.Wrapper):
         assert ran
 
 
+class Wordless(Exception):
+    """It cannot tell its message, because of a fault in it."""
+
+    def __str__(self):
+        return self.message
+
+
 class TwoArguments(Exception):
     """It cannot be made anew from its message, as pickle would."""
 
@@ -152,9 +159,10 @@ def test_actions_never_leave_the_bounds(dtype, scale, register):
     low[:2], high[:2] = (-1, 0.9 * scale), (0.2, scale)  # one rounding out, and an overflow of their sum
     space = gym.spaces.Box(low, high, dtype=dtype)
     policy = Policy(Config(actor_layers=()), gym.spaces.Box(-1, 1, (1,)), space)
+    bounds = policy.low.clone()
     policy.load_state_dict(policy.state_dict() | {"low": torch.full((300,), -1e9)})  # the task's own bounds stay
     assert np.array_equal(space.low, low)
-    policy.load_state_dict(policy.state_dict() | {"low": torch.from_numpy(low.astype(np.float32))})
+    policy.load_state_dict(policy.state_dict() | {"low": bounds})
     env = sac_minitaur.make_training_env(gym.spec(register(low=low, high=high, dtype=dtype)), False)
     env.reset()
     for sign in (-1, 1, 0.999, -1e-3):
@@ -165,7 +173,7 @@ def test_actions_never_leave_the_bounds(dtype, scale, register):
         received = env.action(np.full(300, sign, np.float32))  # what its step gives to the task
         env.step(np.full(300, sign, np.float32))  # which looks whether it is in its space
         assert acted in space and received in space
-        assert (policy.low.numpy() <= forward).all() and (forward <= policy.high.numpy()).all()
+        assert (low <= forward).all() and (forward <= high).all()  # as policy.pt2 acts, in float32
         exact = low.astype(float) + (high.astype(float) - low) * (1 + sign) / 2
         tolerance = (1e-2 if dtype == np.float16 else 1e-5) * scale
         for actions in (acted, received, forward):
@@ -255,14 +263,15 @@ def test_a_task_that_returns_what_no_space_of_its_has(when, wrong, said, monkeyp
         train(tmp_path / "run", **SHORT, **IDS)
 
 
-@pytest.mark.parametrize("error", [ConnectionError, partial(TwoArguments, 7), SystemExit])
+@pytest.mark.parametrize("error", [ConnectionError, partial(TwoArguments, 7), SystemExit, Wordless])
 @pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
 def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path, capsys):
     with pytest.raises(common.TaskError) as caught:
         train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
     text = str(caught.value)
     assert caught.value.__cause__ is None  # which would show it a second time
-    assert "test_tasks.py" in text and f"in {fails}\n" in text and "no server" in text and "died" not in text
+    assert "test_tasks.py" in text and f"in {fails}\n" in text and "died" not in text
+    assert ("failed: Wordless\n" if error is Wordless else "no server") in text
     assert ("Config(resume=" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
 
 
@@ -324,6 +333,15 @@ def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(register,
     for make, error in ((lambda: [].pop(), IndexError), (lambda: open(tmp_path / "map"), FileNotFoundError)):
         with pytest.raises(error):
             main(monkeypatch, "--env-id", register(make))
+
+
+@pytest.mark.parametrize(
+    "entry_point, kwargs", [(f"{__name__}:Missing", {}), ("Echo", {}), (lambda: None, {}), (Echo, {"nothing": 1})]
+)
+def test_a_task_that_gymnasium_cannot_make(entry_point, kwargs, register, monkeypatch, capsys):
+    assert main(monkeypatch, "--env-id", register(entry_point, **kwargs)) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: --env-id Mine-v0 cannot be made: ") and message.count("\n") == 1
 
 
 def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
