@@ -618,8 +618,8 @@ class Run:
                 torch.cuda.set_rng_state(own["random"]["cuda"], self.device)
         if self.writes:
             self._start_files()
-        no_stderr = getattr(sys.stderr, "closed", not sys.stderr)
-        options = {"unit": "step", "disable": not self.writes or no_stderr or None}  # None: only on a terminal
+        hidden = not self.writes or getattr(sys.stderr, "closed", not sys.stderr)
+        options = {"unit": "step", "disable": hidden or None}  # None: only on a terminal
         self.progress = self.stack.enter_context(tqdm(total=config.num_iterations, initial=self.saved_step, **options))
         limit = f"episodes of at most {self.task.max_episode_steps} steps (--max-episode-steps)"
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
@@ -852,8 +852,7 @@ def evaluate_policy(config, script, policy, task, evaluate):
         raise InputError(f"{config.evaluate} does not fit {config.env_id} and this script's network") from None
     torch.set_num_threads(1)  # as in a run's evaluation: the same digits
     seeds, video = evaluation_seeds(config), config.evaluate.with_suffix(".mp4").absolute()
-    bar = tqdm(seeds, disable=getattr(sys.stderr, "closed", not sys.stderr) or None)  # None: only on a terminal
-    _, text = summarize([evaluate(policy, task, seed) for seed in bar])
+    _, text = summarize([evaluate(policy, task, seed) for seed in tqdm(seeds, disable=None if sys.stderr else True)])
     try:
         say(f"{config.evaluate}: {text}")
         if config.video:
