@@ -275,8 +275,9 @@ for moment in ("before", "after_in_parent", "after_in_child"):
         os.register_at_fork(**{moment: partial(around_fork, moment)})
 
 
-def start_worker(task=None):
+def start_worker(registry, task=None):
     """Prepares a worker. It ends with the main process and leaves signals to it. Evaluations play `task` in it."""
+    gym.registry.update(registry)  # the main process's: a task may be made of others
     start_worker.task = task
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: forked, all workers would draw the same
@@ -294,9 +295,9 @@ class SeededEpisodes(gym.Wrapper):
     the reset, it comes to the same state to the last bit. Arrays are copied: a task may change what it gave or got.
     """
 
-    def __init__(self, make_env, key, episode, actions):
+    def __init__(self, registry, make_env, key, episode, actions):
         if os.getpid() != Run.training_process:  # in a worker
-            start_worker()
+            start_worker(registry)
         with telling_task_errors():
             super().__init__(make_env())
         self.key, self.episode, self.actions = key, episode, list(np.asarray(actions))
@@ -350,7 +351,7 @@ class Environments:
         # gymnasium would show a task's error once more for each process.
         warnings.filterwarnings("ignore", module="gymnasium.vector.async_vector_env")
         episodes = enumerate(saved.get("episodes", [(0, [])] * num_envs), rank * num_envs)
-        makers = [partial(SeededEpisodes, make_env, (seed, i), *episode) for i, episode in episodes]
+        makers = [partial(SeededEpisodes, gym.registry, make_env, (seed, i), *episode) for i, episode in episodes]
         workers = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)  # daemons start no processes
         kind = workers if in_workers else gym.vector.SyncVectorEnv
         with contextlib.ExitStack() as making:
@@ -450,7 +451,7 @@ def export_policy(path, policy, observation_shape):
 def _in_worker(file, *arguments):
     with telling_task_errors("the task or the policy"):
         function, large = pickle.loads(file.read_bytes())
-        return function(large, start_worker.task.fn, *arguments)
+        return function(large, start_worker.task, *arguments)
 
 
 def say(line):
@@ -541,8 +542,8 @@ class Run:
                 size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
                 context = multiprocessing.get_context(START_METHOD)
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
-                task = gym.vector.utils.CloudpickleWrapper(self.task)
-                self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start_worker, (task,)))
+                start = gym.vector.utils.CloudpickleWrapper(partial(start_worker, gym.registry, self.task))
+                self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start))
                 with contextlib.ExitStack() as starting:
                     starting.callback(self.kill_at_the_end, multiprocessing.active_children())
                     list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads

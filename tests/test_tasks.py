@@ -434,14 +434,15 @@ def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
 
 
 def test_a_task_that_only_the_main_program_knows(tmp_path):
-    """Where workers are not forked, as in a notebook on a Mac: here with an entry point that only cloudpickle takes."""
+    """Where workers are not forked, as in a notebook on a Mac: with entry points that only cloudpickle takes."""
     (tmp_path / "program.py").write_text(f"""
 import gymnasium as gym
 import common, sac_minitaur
 if __name__ == "__main__":
     from gymnasium.envs.classic_control import PendulumEnv
     common.START_METHOD = "spawn"
-    gym.register("Mine-v0", entry_point=lambda render_mode=None: PendulumEnv(render_mode), max_episode_steps=5)
+    gym.register("Base-v0", entry_point=lambda render_mode=None: PendulumEnv(render_mode))
+    gym.register("Mine-v0", entry_point=lambda **kwargs: gym.make("Base-v0", **kwargs), max_episode_steps=5)
     choices = {TINY | SHORT} | dict(env_id="Mine-v0", num_eval_episodes=1, run_dir="run", video=True)
     print(sac_minitaur.train(sac_minitaur.Config(**choices)))
 """)
