@@ -44,7 +44,7 @@ from pydantic_core import ArgsKwargs, to_json, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 3  # of checkpoints and policies
-# Forked workers start at once and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
+# Forked workers start quickly and share the libraries' memory. They use no GPU and one thread, so a fork is safe.
 START_METHOD = "fork" if sys.platform == "linux" else "spawn"
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 MAY_DIFFER_ON_RESUME = {"num_iterations", "video", "checkpoint_interval", "device", "num_threads", "cuda_graph"}
@@ -111,15 +111,15 @@ def complete_config(given, config_class, tutorial, script):
     `tutorial`. Raises InputError when a file is no good."""
     names = config_class.__dataclass_fields__.keys()
     values = dict(zip(names, given.args or ())) | (given.kwargs or {})
-    rest = tutorial if values.get("tutorial") else {}
+    defaults = tutorial if values.get("tutorial") else {}
     if run := values.get("resume"):
-        rest = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
-        if others := (rest.keys() ^ names) - MAY_DIFFER_ON_RESUME:
+        defaults = read_file(Path(run, "checkpoint.pt"), "checkpoint", script)["config"]
+        if others := (defaults.keys() ^ names) - MAY_DIFFER_ON_RESUME:
             raise InputError(f"{run} is of another version of this script: it differs in {min(others)}")
     elif policy := values.get("evaluate"):  # one of another version may have more fields, or fewer
-        rest = read_file(Path(policy), "policy", script)["config"] | {"video": True}
-        rest = {name: rest[name] for name in names & rest}
-    return ArgsKwargs((), rest | values)
+        defaults = read_file(Path(policy), "policy", script)["config"] | {"video": True}
+        defaults = {name: defaults[name] for name in names & defaults}
+    return ArgsKwargs((), defaults | values)
 
 
 def read_command_line(config_class, description):
@@ -214,8 +214,8 @@ class Ranks:
 def find_task(config, action_space):
     """The gymnasium spec of --env-id, with a time limit for evaluations to end, and its observation and action spaces.
 
-    Worker processes make the task from the spec, because it may not be registered there. Raises InputError when it is
-    unknown or has not the kind of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
+    An error of the task's own code is raised as it is. Raises InputError when the task is unknown or has not the kind
+    of `action_space` that the algorithm needs, `gym.spaces.Discrete` or `Box`.
     """
     name = f"--env-id {config.env_id}"
     if config.env_id.count(":") > 1 or config.env_id.startswith((".", ":")):
@@ -225,13 +225,13 @@ def find_task(config, action_space):
             stack.callback(os.chdir, os.getcwd())  # a simulator may go to its own files
             env = stack.enter_context(gym.make(config.env_id, max_episode_steps=config.max_episode_steps))
             observations, actions = env.observation_space, env.action_space
-            # Not env.spec. It has the task's own wrappers, which gymnasium cannot always compare with new ones. It may
-            # be the spec of another task that this one makes inside itself. And it is None where it cannot be copied.
+            # The registered spec, not env.spec. That has the task's wrappers, which gymnasium cannot always compare to
+            # new ones. It may be None, or that of a task which this one is made of, whose time limit then counts.
             task = copy.copy(gym.registry[env.unwrapped.spec.id])
             task.max_episode_steps = config.max_episode_steps or (env.spec or task).max_episode_steps or 10_000
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)[1:]
-        in_task = any(not frame.filename.startswith(gym.__path__[0]) for frame in frames)
+        in_task = any(not frame.filename.startswith(gym.__path__[0] + os.sep) for frame in frames)
         if in_task and not isinstance(error, (gym.error.Error, ImportError)):
             raise  # with its traceback. What gymnasium itself raises, as for a misspelt entry point, is one line.
         raise InputError(f"{name} cannot be made: {first_line(error)}") from None
@@ -251,23 +251,23 @@ def find_task(config, action_space):
 
 
 @contextlib.contextmanager
-def telling_task_errors(who="the task"):
-    """Turns an exception of the task into a `TaskError`: a worker can always send this one to the main process."""
+def telling_task_errors(what="the task"):
+    """Turns an exception of the task into a `TaskError`, which a running worker can always send to the main process."""
     try:
         yield
     except RunError:
         raise
     except (Exception, SystemExit) as error:
-        raise TaskError(f"{who} failed: {first_line(error)}\n{traceback.format_exc()}") from None
+        raise TaskError(f"{what} failed: {first_line(error)}\n{traceback.format_exc()}") from None
 
 
 def around_fork(moment):
-    """What a task forks ignores Ctrl-C, and other signals end it. They wait until its Python runs, or would be lost."""
-    ours = [number for number in STOP_SIGNALS if getattr(signal.getsignal(number), "__module__", None) == __name__]
+    """A process that a task forks ignores Ctrl-C. Other signals end it. During the fork they wait, so none is lost."""
+    handled = [number for number in STOP_SIGNALS if getattr(signal.getsignal(number), "__module__", None) == __name__]
     if moment == "after_in_child":
-        for number in ours:
+        for number in handled:
             signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_BLOCK if moment == "before" else signal.SIG_UNBLOCK, ours)
+    signal.pthread_sigmask(signal.SIG_BLOCK if moment == "before" else signal.SIG_UNBLOCK, handled)
 
 
 for moment in ("before", "after_in_parent", "after_in_child"):
@@ -312,7 +312,7 @@ class SeededEpisodes(gym.Wrapper):
         for action in replay:
             observation, _, terminated, truncated, _ = self.step(action)
             if terminated or truncated:
-                return self.reset()  # it cannot be repeated: a new episode
+                return self.reset()  # the task went differently and ended: begin a new episode
         return observation, {}
 
     def step(self, action):
@@ -357,13 +357,13 @@ class Environments:
         with contextlib.ExitStack() as making:
             making.callback(run.kill_at_the_end, multiprocessing.active_children())
             if not in_workers and threading.current_thread() is threading.main_thread():
-                # What the task starts in this process ignores Ctrl-C.
+                # What the task's constructor starts in this process ignores Ctrl-C.
                 making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
             self.vector = kind(makers, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
         run.stack.callback(self._end_workers if in_workers else self.vector.close)
         self.observations, _ = self.vector.reset()  # brings each to where its episode stands
         if saved.get("fingerprint") not in (None, self._fingerprint()):
-            run.print("warning: an episode went differently when it was played again: this resume is not exact")
+            say("warning: an episode went differently when it was played again: this resume is not exact")
 
     def step_async(self, actions):
         """Takes actions (K, …). Workers begin the step at once; without them `step_wait` does it."""
@@ -374,7 +374,7 @@ class Environments:
 
     def step_wait(self):
         """The transitions of that step: observations (K, O), actions (K, …), rewards (K,), terminated (K,), next
-        observations (K, O). Where an episode ended, that is its last. `self.observations` has the next one's first."""
+        observations (K, O). If an episode ended, its last one: `self.observations` has the next episode's first."""
         step = self.vector.step_wait() if self.in_workers else self.vector.step(self.actions)
         next_observations, rewards, terminated, truncated, infos = step
         observations, self.observations = self.observations, next_observations.copy()
@@ -457,13 +457,13 @@ def _in_worker(file, *arguments):
 def say(line):
     """Prints a line, above the progress bar. A program whose output nobody reads any more goes on."""
     try:
-        with contextlib.suppress(AttributeError, ValueError):  # there is no stream, or it is closed
+        with contextlib.suppress(AttributeError, ValueError):  # no stream, a closed one, or one without such a letter
             tqdm.write(line)
             sys.stdout.flush()
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # so that a fork's own `print` does not fail either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # so that your own `print` does not fail either
 
 
 class Run:
@@ -495,7 +495,8 @@ class Run:
         processes = self.ranks.world_size
         if config.batch_size % processes:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {processes} processes")
-        stored = processes * min(config.initial_collect_steps // processes, config.replay_buffer_capacity)
+        turns = math.ceil(config.initial_collect_steps / (processes * config.num_envs))  # of all environments
+        stored = processes * min(turns * config.num_envs, config.replay_buffer_capacity)
         if config.batch_size > stored:
             raise InputError(f"--batch-size {config.batch_size} is more than the {stored} transitions stored at first")
         self.batch_size = config.batch_size // processes  # this process's share
@@ -507,14 +508,14 @@ class Run:
         self.directory = self.path.absolute()  # a task may change the current one
         # The results so far. A snapshot is a caption and the policy's weights, for the film of how it learned.
         new = {"tables": {"train": [], "eval": [], "random": []}, "best": (-math.inf, None), "snapshots": []}
-        self.found = {name: self.checkpoint.get(name, value) for name, value in new.items()}
-        self.tables = self.found["tables"]
+        self.results = {name: self.checkpoint.get(name, value) for name, value in new.items()}
+        self.tables = self.results["tables"]
         self.texts = {table: io.StringIO() for table in self.tables}  # the CSVs', so that a row is formatted once
         self.started = time.perf_counter() - self.checkpoint.get("seconds", 0.0)
         self.saved_step = self.checkpoint.get("step", 0)
         self.stopping = self.stopped = False  # this process was asked to stop; all processes agreed to
         self.owner = os.urandom(16)  # in .owner: another process that resumes the run writes its own
-        self.stack = contextlib.ExitStack()
+        self.stack = contextlib.ExitStack()  # what to end and undo when the run ends, the last first
 
     def _require_same_run(self, saved):
         config = plain_config(self.config) | {"run_dir": self.config.run_dir}  # a run cannot move
@@ -556,7 +557,7 @@ class Run:
     def kill_at_the_end(self, others):
         """Lets this process's children, all but `others`, end with the run, whatever they do."""
         for worker in set(multiprocessing.active_children()).difference(others):
-            if not worker.daemon:  # Python ends these; a killed one may hold a lock that Python then waits for
+            if not worker.daemon:  # Python ends daemons, and would wait for a lock that a killed one holds
                 self.stack.callback(worker.kill)
 
     def __exit__(self, kind, error, trace):
@@ -564,7 +565,7 @@ class Run:
         died = isinstance(error, (EOFError, ConnectionError, futures.BrokenExecutor))
         lost = self.ranks.world_size > 1 and (isinstance(error, dist.DistError) or "gloo" in str(error))
         if died or lost or isinstance(error, OSError):
-            reason = "a worker process died" if died else "lost another process: " * lost + first_line(error)
+            reason = "a worker process died" if died else ("lost another process: " if lost else "") + first_line(error)
             raise RunError(f"{reason}; {self._how_to_continue()}") from error
         if isinstance(error, TaskError):
             error.__cause__ = None  # it is the pool's, with the same traceback
@@ -577,7 +578,8 @@ class Run:
         file = Path(getattr(sys.modules.get(type(self.config).__module__), "__file__", "a notebook's cells"))
         if file.name != Path(sys.argv[0]).name:  # not this script runs, but a notebook or a program that calls `train`
             return f"to continue from the last checkpoint: train(Config(resume={str(self.path)!r}))"
-        return f"to continue from the last checkpoint: {python} {shlex.join([sys.argv[0], '--resume', str(self.path)])}"
+        command = shlex.join(Path(part).as_posix() for part in (sys.argv[0], "--resume", self.path))  # on Windows, too
+        return f"to continue from the last checkpoint: {python} {command}"
 
     def _request_stop(self, number, _):
         if self.stopping and number == signal.SIGINT:
@@ -587,7 +589,7 @@ class Run:
             os.write(sys.stderr.fileno(), b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
 
     def stop_requested(self, step):
-        """Whether any rank was asked to stop. Several processes exchange messages for it, so not at every step."""
+        """Whether any rank was asked to stop. Several processes exchange messages for it, at every 20th update."""
         if self.ranks.world_size == 1:
             self.stopped = self.stopping
         elif step % 20 == 0 or step % self.config.eval_interval == 0:
@@ -626,7 +628,7 @@ class Run:
         self.print(f"{config.env_id}, seed {config.seed}, {limit}")
         self.print(f"{self.ranks.world_size} process(es), {config.num_threads} CPU thread(s), device {self.device}")
         self.print(f"replay buffer of {buffer.rows.nbytes / 1e6:.0f} MB when full, run directory {self.path}")
-        if plain_config(config) != saved.get("config"):  # so that a run killed early can go on, with a raised flag
+        if plain_config(config) != saved.get("config"):  # or a kill before the next save would lose these settings
             self.save(self.saved_step)
         self.evaluate(0, policy=None)  # random actions, for comparison
         self.last_logged = time.perf_counter(), self.saved_step
@@ -655,7 +657,7 @@ class Run:
         for table, rows in self.tables.items():
             if rows:
                 self._write_rows(table, rows)
-        if weights := self.found["best"][1]:  # the file may be of an evaluation that came after the checkpoint
+        if weights := self.results["best"][1]:  # the file may be of an evaluation that came after the checkpoint
             self._save("best_policy.pt", "policy", {"weights": weights})
 
     def _log(self, table, step, values):
@@ -666,13 +668,14 @@ class Run:
     def _write_rows(self, table, new):
         """Writes a table's file, which has all rows, and shows TensorBoard the `new` ones."""
         rows, text = self.tables[table], self.texts[table]
-        if added := [name for name in new[-1] if name not in rows[0]]:  # a fork's new metric
+        if added := [name for name in new[-1] if name not in rows[0]]:  # a metric that you added
             rows[0] |= dict.fromkeys(added, math.nan)
             text.truncate(text.seek(0))
         writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
         header = dict(zip(rows[0], rows[0]))
         writer.writerows(new if text.tell() else [header, *rows])
-        self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+        with contextlib.suppress(PermissionError):  # on Windows, while Excel has the file open: the next row writes all
+            self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after `_write`, which raises if another process continues this run
             for name, value in row.items():
                 if name != "step" and math.isfinite(value):
@@ -707,10 +710,10 @@ class Run:
         table = "eval" if policy else "random"
         if not self.writes or self.stopped or any(row["step"] == step for row in self.tables[table][-1:]):
             return
-        policy = policy and copy.deepcopy(policy).cpu().eval()  # a fork may have dropout
+        policy = policy and copy.deepcopy(policy).cpu().eval()  # you may have added dropout
         episodes = self._in_pool(self.evaluate_episode, policy, "policy", evaluation_seeds(self.config))
-        while (under_way := futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION)).not_done and not self.stopping:
-            for episode in under_way.done:
+        while not (self.stopping or all(episode.done() for episode in episodes)):
+            for episode in futures.wait(episodes, 0.1, futures.FIRST_EXCEPTION).done:
                 episode.result()  # raises what went wrong
         if self.stopping:
             return
@@ -721,11 +724,11 @@ class Run:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             require_finite(policy, step)
             weights = policy.state_dict()
-            # Five policies, closer to each other at the beginning, where most is learned.
-            if step >= (len(self.found["snapshots"]) / 4) ** 2 * self.config.num_iterations:
-                self.found["snapshots"].append((f"{step} updates: return {row['average_return']:.1f}", weights))
-            if row["average_return"] > self.found["best"][0]:
-                self.found["best"] = row["average_return"], weights
+            # Five policies, at 0, 1/16, 1/4, 9/16 and all of the updates: most is learned at the beginning.
+            if step >= (len(self.results["snapshots"]) / 4) ** 2 * self.config.num_iterations:
+                self.results["snapshots"].append((f"{step} updates: return {row['average_return']:.1f}", weights))
+            if row["average_return"] > self.results["best"][0]:
+                self.results["best"] = row["average_return"], weights
                 self._save("best_policy.pt", "policy", {"weights": weights})
 
     def _in_pool(self, function, large, name, seeds, *more):
@@ -733,7 +736,7 @@ class Run:
         file = self.scratch / name  # sent through a queue, a large one would hang where a worker has died
         try:
             payload = pickle.dumps((function, large))
-        except Exception:  # at a fork's lambda, or class inside a function
+        except Exception:  # at your lambda, or class inside a function
             with telling_task_errors("sending the policy to a worker"):
                 payload = cloudpickle.dumps((function, large))
         file.write_bytes(payload)
@@ -748,7 +751,7 @@ class Run:
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         random = {"cpu": torch.get_rng_state(), "cuda": cuda}
         replay = {"position": buffer.position}
-        for name, value in vars(buffer).items():  # `rows`, and what a fork keeps beside it
+        for name, value in vars(buffer).items():  # `rows`, and what you keep beside it
             if torch.is_tensor(value) and value.shape[:1] == buffer.rows.shape[:1]:
                 replay[name] = value[: buffer.size].to("cpu", copy=True)
         own = {"buffer": replay, "environments": self.environments.state_dict(), "random": random}
@@ -761,7 +764,7 @@ class Run:
         state = {"step": step, "env_steps": self.environments.steps, "seconds": time.perf_counter() - self.started}
         state |= {"agent": agent.state_dict(), "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers]}
         self._save("policy.pt", "policy", {"weights": copy.deepcopy(agent.policy).cpu().state_dict()})
-        self._save("checkpoint.pt", "checkpoint", state | {"ranks": ranks} | self.found)
+        self._save("checkpoint.pt", "checkpoint", state | {"ranks": ranks} | self.results)
 
     def _save(self, name, kind, state):
         state |= {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
@@ -769,7 +772,7 @@ class Run:
         def write(file):
             torch.save(state, file)
             file.flush()
-            if unsafe := torch.serialization.get_unsafe_globals_in_checkpoint(file.name):  # a fork's np.float64
+            if unsafe := torch.serialization.get_unsafe_globals_in_checkpoint(file.name):  # such as your np.float64
                 what = f"{name} could not be read again: it has {min(unsafe)}, not only tensors and Python's numbers"
                 raise RunError(f"{what}; the last good one is kept")
 
@@ -800,14 +803,14 @@ class Run:
         policy, films = copy.deepcopy(self.agent.policy).cpu().eval(), {}
         if self.config.video:
             self.print("filming the trained agent, a random one, and how it learned ...")
-            learning = [(policy, weights, caption) for caption, weights in self.found["snapshots"]]
+            learning = [(policy, weights, caption) for caption, weights in self.results["snapshots"]]
             with or_warn("films"):
                 films["learning.mp4"] = self._film(learning, "learning.mp4", 4, 25)
                 films["trained_agent.mp4"] = self._film([(policy, None, None)], "trained_agent.mp4")
                 films["random_agent.mp4"] = self._film([(None, None, None)], "random_agent.mp4")
         with or_warn("exported policy"):
             export_policy(self.directory / "policy.pt2", policy, observation_space.shape)
-            policy.load_state_dict(self.found["best"][1])
+            policy.load_state_dict(self.results["best"][1])
             export_policy(self.directory / "best_policy.pt2", policy, observation_space.shape)
         for name, recording in films.items():
             with or_warn(name):
@@ -841,8 +844,7 @@ def summarize(results):
     mean, std, length, length_std = (float(f(x)) for x in (returns, lengths) for f in (np.mean, np.std))
     row = {"average_return": mean, "std_return": std, "min_return": min(returns), "max_return": max(returns)}
     row |= {"average_episode_length": length, "std_episode_length": length_std}
-    text = f"AverageReturn = {mean:.6f} +/- {std:.6f}, AverageEpisodeLength = {length:.6f} +/- {length_std:.6f}"
-    return row, text
+    return row, f"AverageReturn = {mean:.6f} +/- {std:.6f}, AverageEpisodeLength = {length:.6f} +/- {length_std:.6f}"
 
 
 def evaluate_policy(config, script, policy, task, evaluate):

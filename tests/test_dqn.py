@@ -207,8 +207,8 @@ def test_updates_on_the_gpu_are_those_of_the_cpu():
 
 def test_ratio_holds_with_several_environments(tmp_path):
     """On a task of three actions and six observations, whose rewards are costs."""
-    choices = dict(env_id="Acrobot-v1", num_envs=3, collect_steps_per_iteration=2, learning_rate_decay=59)
-    state = checkpoint(path := dqn_cartpole.train(dataclasses.replace(TINY, **choices, run_dir=tmp_path / "run")))
+    values = dict(env_id="Acrobot-v1", num_envs=3, collect_steps_per_iteration=2, learning_rate_decay=59, batch_size=51)
+    state = checkpoint(path := dqn_cartpole.train(dataclasses.replace(TINY, **values, run_dir=tmp_path / "run")))
     assert state["optimizers"][0]["param_groups"][0]["lr"] == 0.0005  # half of it in update 59, the last from 0 on
     assert state["step"] == 60 and 50 + 2 * 60 <= state["env_steps"] < 50 + 2 * 60 + 3
     for row in read_csv(path / "eval.csv"):  # each step costs 1, but for the one that reaches the goal

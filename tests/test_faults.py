@@ -278,6 +278,25 @@ def test_full_disk_from_the_start(small_disk, tmp_path):
     assert_one_line(run, 1, "No space left on device; there is no checkpoint yet")
 
 
+def test_a_table_that_another_program_has_open(tmp_path):
+    """As Excel on Windows: the file cannot be replaced for a while. Later it has all rows."""
+    run = finish("dqn_cartpole", flags("dqn_cartpole", tmp_path / "run"), tmp_path / "output", hold_a_table)
+    assert not run.stderr and "refused" in run.stdout
+    assert [row["step"] for row in read_csv(tmp_path / "run" / "train.csv")] == [*range(20, 301, 20)]
+
+
+def hold_a_table(module):
+    replace, refusals = os.replace, iter([True, True])
+
+    def refuse(source, target):
+        if target.name == "train.csv" and next(refusals, False):
+            print("refused")
+            raise PermissionError(13, "Permission denied")
+        replace(source, target)
+
+    os.replace = refuse
+
+
 def test_files_are_whole_or_not_there(tmp_path):
     """A write that the disk has room for in part only, also one by PyTorch, which raises an error of its own."""
     path = tmp_path / "train.csv"
