@@ -611,6 +611,8 @@ class Run:
                     getattr(buffer, name)[: buffer.size] = stored
                 for optimizer, state in zip(agent.optimizers, saved["optimizers"], strict=True):
                     optimizer.load_state_dict(state)
+                    if any(name not in optimizer.param_groups[0] for name in getattr(optimizer, "defaults", ())):
+                        raise ValueError("saved by another kind of optimizer")
             except (AttributeError, RuntimeError, ValueError):
                 raise InputError(f"{config.resume} does not fit this script's networks, optimizers, replay") from None
             torch.set_rng_state(own["random"]["cpu"])

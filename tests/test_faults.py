@@ -150,12 +150,15 @@ def test_what_resume_and_evaluate_do_not_take(script, reference):
 
 
 def test_a_fork_that_was_changed_since(script, copy, tmp_path):
-    """Its network is larger now, it has an optimizer more, or an optimizer's parameters have groups."""
+    """Its network is larger now, it has one more optimizer or one of another kind, or the parameters have groups."""
     saved = checkpoint(copy)
     larger = {name: torch.stack((value, value)) for name, value in saved["agent"].items()}
     first, *others = saved["optimizers"]
     grouped = first | {"param_groups": 2 * first["param_groups"]}
-    for number, values in enumerate(({"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]})):
+    (sgd,) = torch.optim.SGD([torch.zeros(1)]).state_dict()["param_groups"]
+    of_another_kind = {"state": {}, "param_groups": [sgd | {"params": g["params"]} for g in first["param_groups"]]}
+    optimizers = others, [grouped, *others], [of_another_kind, *others]
+    for number, values in enumerate([{"agent": larger}, *({"optimizers": each} for each in optimizers)]):
         change(copy / "checkpoint.pt", **saved | values)
         run = Process(script, ["--resume", copy], tmp_path / f"output {number}")
         assert_one_line(run, 2, f"{copy} does not fit")
