@@ -318,8 +318,9 @@ class SeededEpisodes(gym.Wrapper):
             observation, reward = self._checked(observation, reward)
         self.actions.append(np.array(action))
         self.total += reward
-        info = {"return and length": (self.total, len(self.actions))}  # so far
+        info = {}
         if terminated or truncated:
+            info = {"return and length": (self.total, len(self.actions))}
             self.episode, self.actions = self.episode + 1, []
         return observation, reward, bool(terminated), bool(truncated), info
 
