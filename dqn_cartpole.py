@@ -108,11 +108,15 @@ class ObservationScaling(nn.Module):
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
 
     def fit(self, observations, ranks):
-        """Drops bounds over 130 times wider than the observations (N, O), which would all come near one number."""
+        """Drops bounds that nobody reaches: scaled by them, all observations (N, O) would come near one number.
+
+        If a bound is over 130 times wider than the data, all over 10 times are dropped. CartPole has no such bound.
+        """
         low, high = observations.amin(0), observations.amax(0)
         ranks.average([low, high])  # in place, over the processes
         half_range = (high - low) / 2
-        beyond = self.half_range > 130 * torch.where(half_range > 0, half_range, 1.0)  # a constant one (a pixel): 1
+        factor = self.half_range / torch.where(half_range > 0, half_range, 1.0)  # of a constant one (a pixel): by 1
+        beyond = (factor > 10) & (factor.amax() > 130)
         self.center.copy_(torch.where(beyond, low + half_range, self.center))
         self.half_range.copy_(torch.where(beyond, half_range.clamp(min=1), self.half_range))
 

@@ -55,13 +55,16 @@ def test_scaling_maps_bounds_to_one():
     observations = torch.tensor([[2.0, -4, 3, 3, 3, 5], [6, 4, -7, -7, -7, 5], [4, 1, 0, 0, 0, 5]])
     scaled = [[-1.0, -1, 3, 3, 3, 5], [1, 1, -7, -7, -7, 5], [0, 0.25, 0, 0, 0, 5]]
     assert scaling(observations).tolist() == scaled
-    # Bounds that nobody reaches are none, on one side too, wherever the data lie. Those within 130 times of these are.
-    low, high = np.float32([-35, -30, 0, 0, -1e6, -1000, -1e6]), np.float32([35, 30, 1e4, 255, 1e6, 2000, 1e6])
+    # Bounds that nobody reaches are none, on one side too, wherever the data lie. Those within ten times of these are.
+    low, high = np.float32([-35, -2, 0, -3, -1e6, -1000, -1e6]), np.float32([35, 2, 1e4, 3, 1e6, 2000, 1e6])
     scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(low, high))
-    data = torch.tensor([[0.25, 0.25, 5, 0, 0, 1000.5, 300], [-0.25, -0.25, 0, 0, 0, 999.5, -300]])
-    scaling.fit(data - torch.tensor([0.05, 0, 0, 0, 0, 0, 0]), common.Ranks())
-    scaled = scaling(torch.tensor([2.0, 15, 5, 255, 3, 1002, 600])).tolist()
-    assert scaled == pytest.approx([2.05, 0.5, 1, 1, 3, 2, 2])
+    data = torch.tensor([[0.2, 0.25, 5, 0.25, 0, 1000.5, 300], [-0.3, -0.25, 0, -0.25, 0, 999.5, -300]])
+    scaling.fit(data, common.Ranks())
+    scaled = scaling(torch.tensor([2.0, 1, 5, 2, 3, 1002, 600])).tolist()
+    assert scaled == pytest.approx([2.05, 0.5, 1, 2, 3, 2, 2])
+    scaling = dqn_cartpole.ObservationScaling(gym.spaces.Box(np.float32([-30, 0]), np.float32([30, 255])))
+    scaling.fit(data[:, [1, 4]], common.Ranks())  # within 130 times, or a black pixel
+    assert scaling(torch.tensor([15.0, 255])).tolist() == [0.5, 1]
     for dtype in (np.uint8, np.longdouble, ">f4"):
         assert dqn_cartpole.ObservationScaling(gym.spaces.Box(0, 1, (2,), dtype)).center.tolist() == [0.5, 0.5]
     unscaled = make_agent(observation_scaling=False)
