@@ -352,8 +352,7 @@ class Environments:
         makers = [partial(SeededEpisodes, gym.registry, make_env, (seed, i), *episode) for i, episode in episodes]
         workers = partial(gym.vector.AsyncVectorEnv, context=START_METHOD, daemon=False)  # daemons start no processes
         kind = workers if in_workers else gym.vector.SyncVectorEnv
-        with contextlib.ExitStack() as making:
-            making.callback(run.kill_at_the_end, multiprocessing.active_children())
+        with run.killed_at_the_end(), contextlib.ExitStack() as making:
             if not in_workers and threading.current_thread() is threading.main_thread():
                 # What the task's constructor starts in this process ignores Ctrl-C.
                 making.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))
@@ -543,8 +542,7 @@ class Run:
                 self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
                 start = gym.vector.utils.CloudpickleWrapper(partial(start_worker, gym.registry, self.task))
                 self.pool = self.stack.enter_context(futures.ProcessPoolExecutor(size, context, start))
-                with contextlib.ExitStack() as starting:
-                    starting.callback(self.kill_at_the_end, multiprocessing.active_children())
+                with self.killed_at_the_end():
                     list(self.pool.map(int, range(size)))  # starts all before anything uses a GPU or threads
             keep_freed_memory()
             self.stack.callback(torch.set_num_threads, torch.get_num_threads())
@@ -552,11 +550,16 @@ class Run:
             failing.pop_all()
         return self
 
-    def kill_at_the_end(self, others):
-        """Lets this process's children, all but `others`, end with the run, whatever they do."""
-        for worker in set(multiprocessing.active_children()).difference(others):
-            if not worker.daemon:  # Python ends daemons, and would wait for a lock that a killed one holds
-                self.stack.callback(worker.kill)
+    @contextlib.contextmanager
+    def killed_at_the_end(self):
+        """The processes that start inside end with the run, whatever they do."""
+        others = multiprocessing.active_children()
+        try:
+            yield
+        finally:
+            for worker in set(multiprocessing.active_children()).difference(others):
+                if not worker.daemon:  # Python ends daemons, and would wait for a lock that a killed one holds
+                    self.stack.callback(worker.kill)
 
     def __exit__(self, kind, error, trace):
         self.stack.close()
