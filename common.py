@@ -89,9 +89,11 @@ def run_main(main):
     sys.exit(status)
 
 
-def first_line(error):  # not str(error), which may fail in a task's own error
-    name, _, text = traceback.format_exception_only(error)[-1].strip().partition(": ")
-    return (text.strip() or name).splitlines()[0][:200]
+def first_line(error):
+    text = ""
+    with contextlib.suppress(Exception):  # a task's own error may fail to tell
+        text = str(error).strip()
+    return (text or type(error).__name__).splitlines()[0][:200]
 
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)

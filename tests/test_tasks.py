@@ -275,6 +275,13 @@ def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, regi
     assert ("Config(resume=" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
 
 
+def test_the_first_line_of_an_error():
+    noted, syntax = ValueError("\nno server\nat all"), SyntaxError("invalid", ("task.py", 1, 1, "a b"))
+    noted.__notes__ = ["try again"]
+    errors = noted, syntax, ValueError(), Wordless()
+    assert [*map(common.first_line, errors)] == ["no server", "invalid (task.py, line 1)", "ValueError", "Wordless"]
+
+
 def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeypatch, tmp_path):
     failing, slow = common.evaluation_seeds(Config(**TINY))
     reset = Echo.reset
