@@ -677,8 +677,9 @@ class Run:
             rows[0] |= dict.fromkeys(added, math.nan)
             text.truncate(text.seek(0))
         writer = csv.DictWriter(text, rows[0], math.nan, lineterminator="\n")
-        header = dict(zip(rows[0], rows[0]))
-        writer.writerows(new if text.tell() else [header, *rows])
+        if not (begun := text.tell()):
+            writer.writeheader()
+        writer.writerows(new if begun else rows)
         with contextlib.suppress(PermissionError):  # on Windows, while Excel has the file open: the next row writes all
             self._write(f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
         for row in new:  # after `_write`, which raises if another process continues this run
