@@ -114,11 +114,11 @@ class ObservationScaling(nn.Module):
         """
         low, high = observations.amin(0), observations.amax(0)
         ranks.average([low, high])  # in place, over the processes
-        half_range = (high - low) / 2
-        factor = self.half_range / torch.where(half_range > 0, half_range, 1.0)  # of a constant one (a pixel): by 1
+        spread = (high - low) / 2  # the half range of the data
+        factor = self.half_range / torch.where(spread > 0, spread, 1.0)  # of a constant one (a pixel): by 1
         beyond = (factor > 10) & (factor.amax() > 130)
-        self.center.copy_(torch.where(beyond, low + half_range, self.center))
-        self.half_range.copy_(torch.where(beyond, half_range.clamp(min=1), self.half_range))
+        self.center.copy_(torch.where(beyond, low + spread, self.center))
+        self.half_range.copy_(torch.where(beyond, spread.clamp(min=1), self.half_range))
 
     def forward(self, observation):
         return (observation - self.center) / self.half_range
