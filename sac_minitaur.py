@@ -21,6 +21,7 @@ Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks 
 import copy
 import dataclasses
 import math
+import os
 import weakref
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import NonNegativeFloat, PositiveInt, StrictBool, model_validator
+from pydantic import NonNegativeFloat, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -44,20 +45,21 @@ class Config:
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 100_000  # gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
-    collect_steps_per_iteration: PositiveInt = 1  # environment steps per update, over all environments and processes
-    num_envs: common.Parallel = 1  # environments that each process steps at once, each in a worker process of its own
+    collect_steps_per_iteration: PositiveInt = 1  # steps of all environments for each update
+    num_envs: common.Count = 1  # environments that each process steps at once, each in a worker process of its own
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
     batch_size: PositiveInt = 256  # transitions per update, over all processes
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
-    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε (Keras' default)
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε. Keras has this value, but adds it before the bias correction
     adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but there not for α
     privileged_critics: bool = True  # ours (theirs: no): critics see speed, turning and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
     gamma: common.Fraction = 0.99  # discount
+    time_limit_terminates: bool = False  # ours (theirs: yes): a time limit counts as an end of the task
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
@@ -66,32 +68,33 @@ class Config:
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
-    tutorial: StrictBool = False  # set every value marked "ours" back to the tutorials'; other flags override it
 
     seed: common.Seed = 0  # source of all randomness
     device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Parallel = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
+    num_threads: common.Count = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
     cuda_graph: bool = False  # on a GPU: record the update once and repeat it, about twice as fast: see `cuda_graph`
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
-    resume: Path | None = None  # directory of a run to continue from its last checkpoint
-    evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
     video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 5_000  # updates between rows of train.csv
     eval_interval: PositiveInt = 10_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 20  # episodes per evaluation
-    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints
-
-    @model_validator(mode="before")
-    @classmethod
-    def _complete(cls, given):  # fills in what is not given
-        return common.complete_config(given, cls, TUTORIAL, "sac_minitaur")
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episodes: not too short
 
 
-TUTORIAL = dict(
-    replay_buffer_capacity=10_000, actor_learning_rate=3e-4, critic_learning_rate=3e-4, alpha_learning_rate=3e-4,
-    adam_beta1=0.9, privileged_critics=False, critic_batch_norm=False, reward_scaling=False, reward_scale_factor=1.0,
-    averaged_actor_tau=1.0, target_entropy_per_action=-0.5,
-)  # fmt: skip
+TUTORIAL = {
+    "replay_buffer_capacity": 10_000,
+    "actor_learning_rate": 3e-4,
+    "critic_learning_rate": 3e-4,
+    "alpha_learning_rate": 3e-4,
+    "adam_beta1": 0.9,
+    "privileged_critics": False,
+    "critic_batch_norm": False,
+    "time_limit_terminates": True,
+    "reward_scaling": False,
+    "reward_scale_factor": 1.0,
+    "averaged_actor_tau": 1.0,
+    "target_entropy_per_action": -0.5,
+}
 
 
 # In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action
@@ -100,14 +103,14 @@ TUTORIAL = dict(
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
     """Linear layers with ReLU between, Glorot-uniform weights and zero biases (the tutorials' initialization)."""
     layers = []
-    for size, units in zip((inputs, *hidden_layers), (*hidden_layers, outputs)):
+    for units in (*hidden_layers, outputs):
         if batch_norm:
-            layers.append(nn.BatchNorm1d(size, momentum=0.01, eps=1e-3))  # of each layer's input, with CrossQ's numbers
-        layers += [nn.Linear(size, units), nn.ReLU(inplace=True)]
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            nn.init.xavier_uniform_(layer.weight)
-            nn.init.zeros_(layer.bias)
+            layers.append(nn.BatchNorm1d(inputs, momentum=0.01, eps=1e-3))  # of each layer's input, CrossQ's numbers
+        linear = nn.Linear(inputs, units)
+        nn.init.xavier_uniform_(linear.weight)
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.ReLU(inplace=True)]
+        inputs = units
     return nn.Sequential(*layers[:-1])  # no ReLU after the outputs
 
 
@@ -158,8 +161,10 @@ class Policy(nn.Module):
     def __init__(self, config, observation_space, action_space):
         super().__init__()
         self.action_space = action_space
+        self.scaling = common.ObservationScaling(observation_space)
         self.actor = Actor(math.prod(observation_space.shape), math.prod(action_space.shape), config.actor_layers)
-        low, high = np.float32(action_space.low), np.float32(action_space.high)
+        low = np.float32(action_space.low)
+        high = np.float32(action_space.high)
         # A float64 bound may lie between two float32 numbers: take the inner one.
         low = np.where(low < action_space.low, np.nextafter(low, high), low)
         high = np.where(high > action_space.high, np.nextafter(high, low), high)
@@ -168,14 +173,14 @@ class Policy(nn.Module):
 
     def forward(self, observation):
         """Actions (batch, *action shape) for observations (batch, *observation shape)."""
-        mean, _ = self.actor(observation.flatten(1))
+        mean, _ = self.actor(self.scaling(observation.flatten(1)))
         return to_bounds(mean.tanh().unflatten(1, self.low.shape), self.low, self.high)
 
     @torch.inference_mode()
     def act(self, observation):
         """The action for one observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
-        action = self(torch.from_numpy(np.array(observation, np.float32))[None])[0].numpy()
-        require_finite(action)
+        batch = torch.from_numpy(np.array(observation, np.float32))[None]
+        action = self(batch)[0].numpy()
         return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
 
 
@@ -184,45 +189,44 @@ def to_bounds(action, low, high):
     return (low / 2 + high / 2 + (high / 2 - low / 2) * action).clip(low, high)
 
 
-def require_finite(actions):
-    """Raises RunError unless all actions are finite, before the task sees them."""
-    if not np.isfinite(actions).all():
-        why = "learning diverged (a smaller learning rate may help), or the observation was not finite"
-        raise common.RunError(f"the actor's actions are not finite: {why}")
-
-
 class ReplayBuffer:
-    """The last `capacity` transitions, on the training device, in float32, each packed into one row of one tensor.
+    """The last `capacity` transitions, on the training device, in float32.
 
-    A row is (observation, action, reward, terminated, next observation), so that sampling is one indexing operation.
-    A time limit does not set `terminated`: there the target still counts the next state's value.
+    `terminated` is 1 only where the task itself ended. After a time limit it is 0: more reward would have followed.
     """
 
     def __init__(self, capacity, state_size, action_size, device):
-        self.sizes = (state_size, action_size, 1, 1, state_size)
-        self.rows = common.empty_replay(capacity, sum(self.sizes), device)
-        self.size = self.position = 0
+        self.observations = common.empty_replay((capacity, state_size), device)
+        self.actions = common.empty_replay((capacity, action_size), device)
+        self.rewards = common.empty_replay((capacity,), device)
+        self.terminated = common.empty_replay((capacity,), device)
+        self.next_observations = common.empty_replay((capacity, state_size), device)
+        self.capacity = capacity
+        self.size = 0
+        self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
         """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full one drops its oldest."""
-        actions = actions.reshape(len(actions), -1)
-        columns = (observations, actions, rewards[:, None], terminated[:, None], next_observations)
-        rows = torch.from_numpy(np.concatenate(columns, axis=1, dtype=np.float32))
-        for row in rows:
-            self.rows[self.position].copy_(row)
-            self.position = (self.position + 1) % len(self.rows)
-            self.size = min(self.size + 1, len(self.rows))
+        count = len(rewards)
+        rows = (self.position + torch.arange(count)) % self.capacity
+        self.observations[rows] = torch.from_numpy(observations).to(self.rewards)
+        self.actions[rows] = torch.from_numpy(actions).to(self.rewards).flatten(1)
+        self.rewards[rows] = torch.from_numpy(rewards).to(self.rewards)
+        self.terminated[rows] = torch.from_numpy(terminated).to(self.rewards)
+        self.next_observations[rows] = torch.from_numpy(next_observations).to(self.rewards)
+        self.position = (self.position + count) % self.capacity
+        self.size = min(self.size + count, self.capacity)
 
     def sample(self, batch_size):
         """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
-        indices = torch.randint(self.size, (batch_size,), device=self.rows.device)
-        observations, actions, rewards, terminated, next_observations = self.rows[indices].split(self.sizes, dim=1)
-        return observations, actions, rewards.squeeze(1), terminated.squeeze(1), next_observations
-
-    def rewards(self):
-        """All stored rewards: (N,)."""
-        _, _, rewards, _, _ = self.rows[: self.size].split(self.sizes, dim=1)
-        return rewards.squeeze(1)
+        rows = torch.randint(self.size, (batch_size,), device=self.rewards.device)
+        return (
+            self.observations[rows],
+            self.actions[rows],
+            self.rewards[rows],
+            self.terminated[rows],
+            self.next_observations[rows],
+        )
 
 
 def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
@@ -256,16 +260,18 @@ class SACAgent(nn.Module):
 
     The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: these O and the
     privileged ones. The policy's actor is a running average of the actor, because a single snapshot may be bad.
-    `ranks.average` takes means over the processes of torchrun. With one process it does nothing.
     """
 
-    def __init__(self, config, observation_space, action_space, state_size, device, ranks):
+    def __init__(self, config, observation_space, action_space, state_size, device):
         super().__init__()
-        self.config, self.device, self.ranks, self.action_shape = config, device, ranks, action_space.shape
+        self.config = config
+        self.device = device
+        self.action_shape = action_space.shape
         action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
         self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_reward_scale
         self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
+        self.scaling = self.policy.scaling
         self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)  # learns; policy.actor follows it
         self.critics = TwinCritics(state_size, action_size, config.critic_layers, config.critic_batch_norm)
         self.target_critics = None if config.critic_batch_norm else copy.deepcopy(self.critics).requires_grad_(False)
@@ -274,34 +280,43 @@ class SACAgent(nn.Module):
 
         adam = {"betas": (config.adam_beta1, 0.999), "eps": config.adam_epsilon, "fused": True}
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
-        actor_group = {"params": self.actor.parameters(), "lr": config.actor_learning_rate}
-        alpha_group = {"params": [self.log_alpha], "lr": config.alpha_learning_rate}
-        self.actor_optimizer = torch.optim.Adam([actor_group, alpha_group], **adam)  # `update` adds up their losses
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer]  # saved; add a scheduler here
+        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate, **adam)
+        self.alpha_optimizer = torch.optim.Adam([self.log_alpha], config.alpha_learning_rate, **adam)
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]  # what a checkpoint saves
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
         return (2 * torch.rand(count, *self.action_shape) - 1).numpy()
 
-    def fit_reward_scale(self, rewards):
-        """Divides the scale by the standard deviation of the rewards (N,), over all processes."""
+    def fit_scaling(self, observations, rewards):
+        """Fits the scales to observations (N, S) and rewards (N,) of random actions, over all processes.
+
+        Rewards are divided by their standard deviation.
+        """
+        self.scaling.fit(observations[:, : self.actor.observation_size])
         if self.config.reward_scaling:
             mean = rewards.mean()
-            self.ranks.average([mean])  # in place, over the processes
+            common.average([mean])  # in place, over the processes
             variance = (rewards - mean).square().mean()
-            self.ranks.average([variance])
+            common.average([variance])
             std = variance.sqrt()
             # Rewards that were all equal stay as they are: their std is 0 but for rounding.
-            self.reward_scale /= torch.where(std > 1e-6 * mean.abs(), std, 1.0)
+            divisor = torch.where(std > 1e-6 * mean.abs(), std, 1.0)
+            self.reward_scale.copy_(self.config.reward_scale_factor / divisor)
+
+    def scaled(self, observations):
+        """Observations (…, S) with the task's numbers scaled. The privileged ones stay as they are."""
+        size = self.actor.observation_size
+        return torch.cat((self.scaling(observations[..., :size]), observations[..., size:]), dim=-1)
 
     @torch.no_grad()
     def act(self, observations):
         """Sampled actions (K, *action shape) in [-1, 1] for flat observations (K, S), from numpy to numpy."""
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
-        actions, _ = self.actor.sample(observations)
-        actions = actions.view(-1, *self.action_shape).cpu().numpy()
-        require_finite(actions)
-        return actions
+        actions, _ = self.actor.sample(self.scaled(observations))
+        if not actions.isfinite().all():
+            raise FloatingPointError("the actor's actions are not finite: learning diverged; try smaller learning rates")
+        return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
         """One gradient step of the critics, then of the actor and α. Policy and target critics follow.
@@ -311,6 +326,8 @@ class SACAgent(nn.Module):
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S); the actor uses O of S
+        s = self.scaled(s)
+        next_s = self.scaled(next_s)
         rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
 
@@ -329,14 +346,29 @@ class SACAgent(nn.Module):
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
         loss_q = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
-        self._gradient_step(self.critic_optimizer, loss_q, self.critics.buffers())
+        self.critic_optimizer.zero_grad()
+        loss_q.backward()
+        # Several processes: the mean of their gradients, and of batch normalization's running statistics.
+        statistics = [buffer for buffer in self.critics.buffers() if buffer.is_floating_point()]
+        common.average([*(parameter.grad for parameter in self.critics.parameters()), *statistics])
+        self.critic_optimizer.step()
 
-        # The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s). α falls while the entropy is above its target.
-        # α is detached in the actor's loss, log π in α's. So one backward pass of the sum gives each its own gradient.
+        # The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s).
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
+        self.critics.requires_grad_(False)  # the loss passes through the critics; they keep their weights
         loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
+        self.actor_optimizer.zero_grad()
+        loss_pi.backward()
+        common.average(parameter.grad for parameter in self.actor.parameters())
+        self.actor_optimizer.step()
+        self.critics.requires_grad_(True)
+
+        # α falls while the entropy is above its target, and rises below it.
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
-        self._gradient_step(self.actor_optimizer, loss_pi + loss_alpha)
+        self.alpha_optimizer.zero_grad()
+        loss_alpha.backward()
+        common.average([self.log_alpha.grad])
+        self.alpha_optimizer.step()
 
         # The policy's actor and the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
         soft_update(self.policy.actor, self.actor, config.averaged_actor_tau)
@@ -345,15 +377,6 @@ class SACAgent(nn.Module):
         metrics = {"critic_loss": loss_q, "actor_loss": loss_pi, "alpha_loss": loss_alpha, "alpha": alpha}
         metrics |= {"entropy": -log_probs.mean(), "mean_q": q.mean()}
         return {name: value.detach() for name, value in metrics.items()}
-
-    def _gradient_step(self, optimizer, loss, running_statistics=()):
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        optimizer.zero_grad()
-        loss.backward(inputs=parameters)  # only these: the actor's loss passes through the critics
-        # Several processes: the mean of their gradients, and of batch normalization's running statistics.
-        statistics = [buffer for buffer in running_statistics if buffer.is_floating_point()]  # not the count of batches
-        self.ranks.average([parameter.grad for parameter in parameters] + statistics)
-        optimizer.step()
 
 
 @torch.no_grad()
@@ -368,13 +391,16 @@ def soft_update(target, source, tau):
 def cuda_graph(agent):
     """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, which this and later calls replay.
 
-    Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. But a
-    replay runs no Python: what Python reads, computes or decides in `update`, as a scheduler does, stays as recorded.
+    Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. A recorded
+    update repeats the same operations: leave --cuda-graph out when your update has an `if` on data.
     Raises InputError where there is no GPU, or more than one process.
     """
-    if agent.device.type != "cuda" or agent.ranks.world_size > 1:
+    if agent.device.type != "cuda" or torch.distributed.is_initialized():
         raise common.InputError("--cuda-graph is for one process with a CUDA GPU: use --no-cuda-graph")
-    graph, calls, recorded, metrics = torch.cuda.CUDAGraph(), 0, None, None
+    graph = torch.cuda.CUDAGraph()
+    calls = 0
+    recorded = None
+    metrics = None
 
     def update(batch):
         nonlocal calls, recorded, metrics
@@ -385,8 +411,9 @@ def cuda_graph(agent):
             groups = [group for optimizer in agent.optimizers for group in optimizer.param_groups]
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
+            recorded = batch
             with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # computes nothing, replays do
-                recorded, metrics = batch, agent.update(batch)
+                metrics = agent.update(recorded)
             for group in groups:
                 group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
         for graph_input, values in zip(recorded, batch):
@@ -397,79 +424,122 @@ def cuda_graph(agent):
     return update
 
 
-def evaluate(policy, task, seed):
-    """Return and length of one episode of `task`, a gymnasium spec, with `policy` (None: random actions)."""
-    with gym.make(task) as env:
-        env.action_space.seed(seed)
-        observation, _ = env.reset(seed=seed)
-        episode_return, length, done = 0.0, 0, False
-        while not done:
-            action = policy.act(observation) if policy else env.action_space.sample()
-            observation, reward, terminated, truncated, _ = env.step(action)
-            episode_return, length, done = episode_return + float(reward), length + 1, terminated or truncated
+def evaluate(policy, env, seed):
+    """Return and length of one episode of a gymnasium environment. `policy` None: random actions."""
+    observation, _ = env.reset(seed=seed)
+    env.action_space.seed(seed)  # after the reset: some tasks make their spaces there
+    episode_return = 0.0
+    length = 0
+    done = False
+    while not done:
+        action = policy.act(observation) if policy else env.action_space.sample()
+        observation, reward, terminated, truncated, _ = env.step(action)
+        episode_return += float(reward)
+        length += 1
+        done = terminated or truncated
     return episode_return, length
 
 
-def make_training_env(task, privileged):
-    """The task with actions in [-1, 1], as the agent sees it in training.
+def make_training_env(task, privileged, main_process):
+    """The task as the agent sees it in training: actions in [-1, 1], flat observations, returns that are counted.
 
     With `privileged`, the environment's `privileged_observation` (S − O,), if it has one, follows the observation (O,).
     """
-    env = gym.make(task)
-    low, high, dtype = env.action_space.low, env.action_space.high, env.action_space.dtype
+    if os.getpid() != main_process:
+        common.prepare_worker()
+    env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
+    low = env.action_space.low
+    high = env.action_space.high
+    dtype = env.action_space.dtype
     unit = gym.spaces.Box(-1, 1, low.shape, np.float32)
     env = gym.wrappers.TransformAction(env, lambda action: to_bounds(action, low, high).astype(dtype), unit)
+    env = gym.wrappers.FlattenObservation(env)
     if privileged and hasattr(env.unwrapped, "privileged_space"):
-        own, more, observe = env.observation_space, env.unwrapped.privileged_space, env.unwrapped.privileged_observation
+        own = env.observation_space
+        more = env.unwrapped.privileged_space
+        observe = env.unwrapped.privileged_observation
         both = gym.spaces.Box(np.append(own.low, more.low), np.append(own.high, more.high))
         env = gym.wrappers.TransformObservation(env, lambda observation: np.append(observation, observe()), both)
     return env
 
 
-def train(config):
-    """Trains as `config` says and returns the run directory's path, after Ctrl-C, too.
+def make_vector_env(task, config):
+    """`num_envs` environments (K), each in a worker process. One whose episode has ended resets itself at once."""
+    make = partial(make_training_env, task, config.privileged_critics, os.getpid())
+    return gym.vector.AsyncVectorEnv(
+        [make] * config.num_envs, context=common.START_METHOD, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
+    )
 
-    Raises InputError for an unusable config, RunError when the run fails, TaskError when the task does. Saved files
-    stay. A resumed run equals an uninterrupted one: `common.SeededEpisodes` plays the running episodes again.
+
+def store(buffer, observations, actions, step, run):
+    """Stores the transitions of one vector step. Returns the observations to act on next: (K, S)."""
+    next_observations, rewards, terminated, truncated, infos = step
+    ended = terminated | truncated
+    if run.config.time_limit_terminates:  # theirs
+        terminated = ended
+    # Where an episode ended, next_observations has the next episode's first one. The transition has the last one.
+    last_observations = next_observations.copy()
+    for i in np.flatnonzero(ended):
+        last_observations[i] = infos["final_obs"][i]
+        episode = infos["final_info"]["episode"]
+        run.log_episode(episode["r"][i], episode["l"][i])
+    buffer.add(observations, actions, rewards, terminated, last_observations)
+    run.env_steps += len(rewards) * run.world_size
+    return next_observations
+
+
+def train(config, resume=None):
+    """Trains as `config` says and returns the run directory's path.
+
+    With `resume`, a run's directory, that run continues: `common.continued` says what is then taken from `config`.
+    Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
+    config, checkpoint = common.continued(config, resume, "sac_minitaur")
+    processes = common.join_processes()  # of torchrun: rank, number of processes, rank on this machine
+    rank, world_size, _ = processes
     task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
-    with common.Run(config, "sac_minitaur", task, evaluate) as run:
-        envs = common.Environments(partial(make_training_env, task, config.privileged_critics), run, in_workers=True)
-        torch.manual_seed(config.seed)  # the same networks on every rank
-        _, state_size = envs.observations.shape  # S, with the privileged numbers
-        agent = SACAgent(config, observation_space, action_space, state_size, run.device, run.ranks)
+    with common.Run("sac_minitaur", config, task, evaluate, resume, processes) as run:
+        envs = make_vector_env(task, config)
+        run.stack.callback(envs.close, terminate=True)  # where the run fails
+        _, state_size = envs.observation_space.shape  # S, with the privileged numbers
+        torch.manual_seed(config.seed)  # the same networks in every process
+        agent = SACAgent(config, observation_space, action_space, state_size, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
-        update = cuda_graph(agent) if config.cuda_graph else agent.update
-        torch.manual_seed(common.derive_seed(config.seed, run.ranks.rank))  # own actions and batches on every rank
-        step = run.start(agent, buffer, envs)  # the number of updates: 0, or the checkpoint's
-        # Random actions first. After the last, fit the reward scale: in this loop, which a resumed run skips.
-        while envs.steps < config.initial_collect_steps and not run.stop_requested(step):
-            envs.step_async(agent.random_actions(config.num_envs))
-            buffer.add(*envs.step_wait())
-            if envs.steps >= config.initial_collect_steps:
-                agent.fit_reward_scale(buffer.rewards())
-        while step < config.num_iterations:
-            if step % config.eval_interval == 0:
-                run.evaluate(step, agent.policy)
-            if run.stop_requested(step):
-                break
+        update_agent = cuda_graph(agent) if config.cuda_graph else agent.update
+        torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process
+        numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process's environments
+        start = run.begin(agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
 
-            # The next update needs `due` steps in all. A turn of this loop steps all environments, updates, or both.
-            # The physics runs during the update, which learns from the steps before this one.
-            due = config.initial_collect_steps + (step + 1) * config.collect_steps_per_iteration
-            collecting = envs.steps < due
-            if collecting:
-                envs.step_async(agent.act(envs.observations))
-            if envs.steps >= due:  # step_async has counted the new steps
-                metrics = update(buffer.sample(run.batch_size))  # this process's share of the batch
-                step += 1
-                run.log_training(step, metrics)  # a row every log_interval updates
-            if collecting:
-                buffer.add(*envs.step_wait())  # the step that ran during the update
-            if step - run.saved_step >= config.checkpoint_interval:
-                run.save(step)
+        if run.env_steps < config.initial_collect_steps:
+            observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in numbers])
+            while run.env_steps < config.initial_collect_steps:
+                run.stop_if_requested(start)
+                actions = agent.random_actions(config.num_envs)
+                observations = store(buffer, observations, actions, envs.step(actions), run)
+            agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
-        run.finish(step, observation_space)  # checkpoint, evaluation, curve, films
+        for update in range(start, config.num_iterations):
+            # gymnasium cannot save a task in mid-episode. So every checkpoint begins new episodes, killed or not. The
+            # episodes that are cut have not ended: the transitions stored keep their bootstrap.
+            if update == start or update % config.checkpoint_interval == 0:
+                run.save(update)
+                observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])
+            if update % config.eval_interval == 0:
+                run.evaluate(update, agent.policy)
+            run.stop_if_requested(update)
+
+            for _ in range(config.collect_steps_per_iteration - 1):
+                actions = agent.act(observations)
+                observations = store(buffer, observations, actions, envs.step(actions), run)
+            # The update learns from the steps before this one, while the simulators work.
+            actions = agent.act(observations)
+            envs.step_async(actions)
+            metrics = update_agent(buffer.sample(config.batch_size // world_size))  # this process's share of the batch
+            observations = store(buffer, observations, actions, envs.step_wait(), run)
+            run.log(update + 1, metrics)  # a row every log_interval updates
+
+        envs.close()
+        run.finish(config.num_iterations, observation_space.shape)  # checkpoint, evaluation, curve, films
         return run.path
 
 
@@ -678,12 +748,13 @@ if "MinitaurBulletEnv-v0" not in gym.registry:
 
 
 def main():
-    config = common.read_command_line(Config, __doc__)
-    if config.evaluate is None:
-        train(config)
-    else:
-        task, *spaces = common.find_task(config, gym.spaces.Box)
-        common.evaluate_policy(config, "sac_minitaur", Policy(config, *spaces), task, evaluate)
+    config, resume, policy_file = common.read_command_line("sac_minitaur", Config, TUTORIAL, __doc__)
+    if policy_file is None:
+        train(config, resume)
+        return
+    task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
+    policy = Policy(config, observation_space, action_space)
+    common.evaluate_file(policy_file, "sac_minitaur", config, policy, task, evaluate)
 
 
 if __name__ == "__main__":
