@@ -1,4 +1,4 @@
-"""What both scripts need besides their algorithms: the command line, files, evaluation, a run's tables and films.
+"""What both scripts need besides their algorithms: the command line, files, workers, and a run's tables and films.
 
 No loss and no replay buffer is here, and no training environment is stepped here.
 """
@@ -7,15 +7,12 @@ import argparse
 import contextlib
 import copy
 import csv
-import ctypes
 import dataclasses
-import functools
 import io
 import math
 import multiprocessing
 import os
 import pickle
-import shlex
 import signal
 import sys
 import tempfile
@@ -59,8 +56,8 @@ class InputError(Exception):
 def run_main(main):
     """Calls `main` as a script does: an InputError becomes one line and exit status 2, Ctrl-C exit status 130."""
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+        stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+    os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     try:
         main()
         return
@@ -73,6 +70,18 @@ def run_main(main):
     if dist.is_initialized():
         os._exit(status)  # torchrun's other processes are not waited for: they may be gone
     sys.exit(status)
+
+
+def say(line):
+    """Prints a line, above the progress bar."""
+    tqdm.write(line)
+    sys.stdout.flush()
+
+
+def first_line(error):
+    """The first line of an exception's message, or its type where it has none."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0][:200]
 
 
 # The command line
@@ -120,7 +129,7 @@ def continued(config, resume, script):
         return config, None
     checkpoint, saved = read_file(Path(resume) / "checkpoint.pt", "checkpoint", script, type(config))
     if config.num_iterations < saved.num_iterations:
-        raise InputError(f"--num-iterations {config.num_iterations}: the run has {saved.num_iterations} already: raise it")
+        raise InputError(f"--num-iterations {config.num_iterations} is less than the run's {saved.num_iterations}")
     changes = {}
     for field in dataclasses.fields(config):
         new = getattr(config, field.name)
@@ -133,16 +142,11 @@ def continued(config, resume, script):
     return dataclasses.replace(saved, **changes), checkpoint
 
 
-def plain_config(config):
-    """The config as a dict of numbers, strings and lists. The directory is not in it: a run may be moved."""
-    return to_jsonable_python(dataclasses.asdict(config) | {"run_dir": None})
-
-
 # Files
 
 
 def write_atomically(path, write):
-    """Lets `write(file)` fill a temporary file, then renames it to `path`: a kill leaves the old file or the new one."""
+    """Lets `write(file)` fill a temporary file, then renames it: a kill leaves the old file or the new one."""
     temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
     try:
         with open(temporary, "wb") as file:
@@ -179,19 +183,23 @@ def read_file(path, kind, script, config_class):
         raise InputError(f"{path} has a config that this version of the script cannot use: {what}") from None
 
 
-def first_line(error):
-    """The first line of an exception's message, or its type where it has none."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:200]
-
-
 def export_policy(path, policy, observation_shape):
     """Writes `policy`, for any batch size, so that `torch.export.load(path).module()` needs none of our code."""
     batch = torch.zeros((2, *observation_shape))
     program = torch.export.export(policy, (batch,), dynamic_shapes=({0: torch.export.Dim("batch")},))
-    archive = io.BytesIO()
-    torch.export.save(program, archive)
-    write_atomically(path, lambda file: file.write(archive.getvalue()))
+    write_atomically(path, lambda file: torch.export.save(program, file))
+
+
+def cpu_copy(policy):
+    """A copy of a policy for evaluation, on the CPU."""
+    return copy.deepcopy(policy).cpu().eval()
+
+
+def with_weights(policy, weights):
+    """A copy of a policy with other weights."""
+    other = copy.deepcopy(policy)
+    other.load_state_dict(weights)
+    return other
 
 
 # Tasks, seeds, devices
@@ -213,58 +221,43 @@ def find_task(config, action_space):
         hint = "a package's task is written package:Task-v0, as highway_env:highway-v0"
         raise InputError(f"{name} cannot be made: {first_line(error)} ({hint})") from None
     with env:
-        require_spaces(env, name, action_space)
-        wrapper = env
-        while isinstance(wrapper, gym.Wrapper):
-            kind = type(wrapper).__name__
-            if kind in ("NormalizeObservation", "NormalizeReward"):
-                say(f"warning: each evaluation's {kind} starts anew: it cannot know the statistics of training")
-            wrapper = wrapper.env
+        require_spaces(name, env.observation_space, env.action_space, action_space)
+        for wrapper in ("NormalizeObservation", "NormalizeReward"):
+            if wrapper in str(env):  # which names all wrappers
+                say(f"warning: each evaluation's {wrapper} starts anew: it cannot know the statistics of training")
         task = copy.copy(gym.registry[env.unwrapped.spec.id])
-        limit = config.max_episode_steps or env.spec.max_episode_steps
-        steps = config.checkpoint_interval * config.collect_steps_per_iteration
-        if limit is not None and steps < limit:
-            least = math.ceil(limit / config.collect_steps_per_iteration)
-            what = f"--checkpoint-interval {config.checkpoint_interval} cuts every episode of {limit} steps"
-            raise InputError(f"{what} before its end: use {least} or more, or a smaller --max-episode-steps")
-        task.max_episode_steps = limit or 10_000  # an evaluation has to end
-        return task, env.observation_space, env.action_space
+        task.max_episode_steps = config.max_episode_steps or env.spec.max_episode_steps
+    if task.max_episode_steps is None:
+        task.max_episode_steps = 10_000  # an evaluation has to end
+    elif task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
+        what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {task.max_episode_steps} steps"
+        raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
+    return task, env.observation_space, env.action_space
 
 
-def require_spaces(env, name, action_space):
-    """Raises InputError unless the observations are a Box, and the actions are what DQN (Discrete) or SAC (Box) needs."""
-    observations = env.observation_space
-    actions = env.action_space
+def require_spaces(name, observations, actions, action_space):
+    """Raises InputError unless a task's spaces are a Box, and a Discrete from 0 for DQN or a Box of floats for SAC."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         hint = "gymnasium.wrappers.FlattenObservation makes one of most others"
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed ({hint})")
-    if action_space is gym.spaces.Discrete:
-        needed = "Discrete from 0"
-        fits = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
-        other = "sac_minitaur.py" if isinstance(actions, gym.spaces.Box) else None
-    else:
-        needed = "Box of some dimension, of floats with finite bounds, low < high,"
-        fits = is_bounded_box(actions)
-        other = "dqn_cartpole.py" if isinstance(actions, gym.spaces.Discrete) else None
+    fits = isinstance(actions, action_space)
+    if fits and action_space is gym.spaces.Discrete:
+        fits = actions.start == 0
+    if fits and action_space is gym.spaces.Box:
+        fits = actions.dtype in (np.float16, np.float32, np.float64) and math.prod(actions.shape) * len(actions.shape)
+    if fits and action_space is gym.spaces.Box:
+        widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()  # as the networks compute
+        fits = (widths.isfinite() & (widths > 0)).all()
     if not fits:
-        hint = f"{other} takes it" if other else "gymnasium.wrappers.TransformAction can map another one to it"
-        raise InputError(f"{name} has the action space {actions}: a {needed} is needed ({hint})")
-
-
-def is_bounded_box(space):
-    """Whether a space is a Box of floats with bounds that are finite, and apart, in the float32 of the networks."""
-    if not isinstance(space, gym.spaces.Box) or space.dtype not in (np.float16, np.float32, np.float64):
-        return False
-    if not space.shape or 0 in space.shape:
-        return False
-    widths = torch.tensor(space.high).float() - torch.tensor(space.low).float()
-    return bool((widths.isfinite() & (widths > 0)).all())
+        needed = "dqn_cartpole.py needs a Discrete from 0, sac_minitaur.py a Box of floats with bounds, low < high"
+        hint = "gymnasium.wrappers.TransformAction can map others"
+        raise InputError(f"{name} has the action space {actions}: {needed} ({hint})")
 
 
 class ObservationScaling(torch.nn.Module):
     """Brings flat observations (…, O) near [-1, 1], number by number. It is a part of the policy.
 
-    A number with bounds, of its space, is mapped from them. `fit` corrects this by data. All else stays as it is.
+    What has bounds in the task's space is mapped from them. `fit` corrects this by data. All else stays as it is.
     """
 
     def __init__(self, space):
@@ -273,9 +266,9 @@ class ObservationScaling(torch.nn.Module):
         high = torch.from_numpy(np.float32(space.high)).flatten()
         half_range = (high - low) / 2
         bounded = half_range.isfinite() & (half_range > 0)
+        self.register_buffer("bounded", bounded)
         self.register_buffer("center", torch.where(bounded, low + half_range, 0.0))
         self.register_buffer("half_range", torch.where(bounded, half_range, 1.0))
-        self.register_buffer("bounded", bounded)
 
     def fit(self, observations):
         """Corrects the scales by observations (N, O) of random actions.
@@ -288,9 +281,9 @@ class ObservationScaling(torch.nn.Module):
         high = observations.amax(0)
         average([low, high])  # in place, over torchrun's processes
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        factor = self.half_range / spread
-        if (self.bounded & (factor > 130)).any():
-            self.bounded &= factor <= 10
+        times_wider = self.half_range / spread
+        if (self.bounded & (times_wider > 130)).any():
+            self.bounded &= times_wider <= 10
             self.center[~self.bounded] = 0.0
             self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
@@ -316,13 +309,13 @@ def select_device(name, local_rank=0):
 
     Raises InputError for a device that is not there.
     """
-    gpus = torch.cuda.device_count()
     if name == "auto":
-        name = "cuda" if gpus else "cpu"
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     device = torch.device(f"cuda:{local_rank}" if name == "cuda" else name)
-    available = {"cpu": True, "mps": torch.backends.mps.is_available(), "cuda": (device.index or 0) < gpus}
-    if not available[device.type]:
-        raise InputError(f"--device {device} is not there (CUDA GPUs found: {gpus}): use --device cpu")
+    try:
+        torch.empty(1, device=device)
+    except (AssertionError, RuntimeError) as error:
+        raise InputError(f"--device {device} cannot be used ({first_line(error)}): use --device cpu") from None
     return device
 
 
@@ -335,32 +328,16 @@ def empty_replay(shape, device):
         raise InputError(f"--replay-buffer-capacity {shape[0]} takes {size}, more than is free: use less") from None
 
 
-def keep_freed_memory():
-    """Tells glibc to keep what is freed. Otherwise every update would map its tensors in afresh, page by page."""
-    with contextlib.suppress(OSError, AttributeError):  # no glibc
-        libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD, the most that glibc before 2.35 takes
-        libc.mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD
-
-
 # Processes
 
 
 def join_processes():
-    """This process's rank among those that torchrun started, their number, and its rank on its machine.
-
-    Without torchrun 0, 1, 0. Raises InputError when torchrun's variables are no good.
-    """
+    """This process's rank among those that torchrun started, their number, and its rank on its machine."""
     if os.environ.get("WORLD_SIZE", "1") == "1":
         return 0, 1, 0
-    try:
-        local_rank = int(os.environ["LOCAL_RANK"])
-        if not dist.is_initialized():
-            dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-    except (KeyError, ValueError, dist.DistError) as error:
-        what = f"WORLD_SIZE is set but the processes cannot join: {first_line(error)}"
-        raise InputError(f"{what}; start them with torchrun, or unset it") from None
-    return dist.get_rank(), dist.get_world_size(), local_rank
+    if not dist.is_initialized():
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+    return dist.get_rank(), dist.get_world_size(), int(os.environ["LOCAL_RANK"])
 
 
 def average(tensors):
@@ -377,7 +354,7 @@ def average(tensors):
 
 @contextlib.contextmanager
 def worker_pool(size, task):
-    """A pool of `size` processes to play `task` in. They, and all that start until its end, are killed at its end."""
+    """A pool of `size` processes that play `task`. They, and all that start until its end, are killed at its end."""
     context = multiprocessing.get_context(START_METHOD)
     if START_METHOD == "forkserver":
         context.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once, for all workers
@@ -395,9 +372,11 @@ def worker_pool(size, task):
         pool.shutdown(wait=False, cancel_futures=True)
 
 
+worker = {}  # in a process of the pool: its task, and the environment, made once
+
+
 def prepare_worker(task=None):
     """Prepares a worker process: Ctrl-C is the main process's, and it ends with that, even when that is killed."""
-    prepare_worker.task = task
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: all workers begin with copies of the same
@@ -408,23 +387,20 @@ def prepare_worker(task=None):
         os._exit(1)
 
     threading.Thread(target=end_with_main_process, daemon=True).start()
-
-
-@functools.cache
-def worker_environment():
-    """The environment of this worker. It is made once: a simulator may take long to start."""
-    return gym.make(pickle.loads(prepare_worker.task))
+    if task is not None:
+        worker["task"] = pickle.loads(task)
+        worker["env"] = gym.make(worker["task"])
 
 
 def play_in_worker(file, seed):
-    """One episode in a worker: return and length."""
+    """One episode in a worker: return and length. The file holds `evaluate` and the policy."""
     evaluate, policy = pickle.loads(file.read_bytes())
-    return evaluate(policy, worker_environment(), seed)
+    return evaluate(policy, worker["env"], seed)
 
 
 def film_in_worker(file, *arguments):
-    """A film made in a worker."""
-    film(pickle.loads(file.read_bytes()), pickle.loads(prepare_worker.task), *arguments)
+    """A film made in a worker. The file holds the clips."""
+    film(pickle.loads(file.read_bytes()), worker["task"], *arguments)
 
 
 # Evaluation, films, the curve
@@ -441,11 +417,9 @@ def summarize(results):
         "average_episode_length": float(lengths.mean()),
         "std_episode_length": float(lengths.std()),
     }
-    text = (
-        f"AverageReturn = {row['average_return']:.6f} +/- {row['std_return']:.6f}, "
-        f"AverageEpisodeLength = {row['average_episode_length']:.6f} +/- {row['std_episode_length']:.6f}"
-    )
-    return row, text
+    text = "AverageReturn = {average_return:.6f} +/- {std_return:.6f}, "
+    text += "AverageEpisodeLength = {average_episode_length:.6f} +/- {std_episode_length:.6f}"
+    return row, text.format_map(row)
 
 
 def evaluate_file(path, script, config, policy, task, evaluate):
@@ -459,14 +433,21 @@ def evaluate_file(path, script, config, policy, task, evaluate):
     torch.set_num_threads(1)  # as in a run's evaluation: the same digits
     seeds = evaluation_seeds(config)
     with gym.make(task) as env:
-        results = [evaluate(policy, env, seed) for seed in tqdm(seeds, disable=None)]
-    _, text = summarize(results)
+        _, text = summarize([evaluate(policy, env, seed) for seed in tqdm(seeds, disable=None)])
     say(f"{path}: {text}")
     if config.video:
-        video = path.with_suffix(".mp4")
-        with or_warn("video"):
-            film([(policy, None)], task, seeds[0], video)
-            say(f"filmed one episode: {video}")
+        with or_warn("film"):
+            film([(policy, None)], task, seeds[0], path.with_suffix(".mp4"))
+            say(f"filmed one episode: {path.with_suffix('.mp4')}")
+
+
+@contextlib.contextmanager
+def or_warn(what):
+    """Turns an exception into a printed warning."""
+    try:
+        yield
+    except Exception as error:
+        say(f"warning: no {what} ({first_line(error)})")
 
 
 def film(clips, task, seed, path, seconds=math.inf):
@@ -513,10 +494,8 @@ def with_caption(frame, caption):
     if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3:
         found = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
         raise ValueError(f"the task's render returned {found}; needed: an array of uint8, (height, width, 3)")
-    if caption is None:
-        return frame
     image = Image.fromarray(frame)
-    ImageDraw.Draw(image).text((8, 8), caption, "black", font_size=20, stroke_width=2, stroke_fill="white")
+    ImageDraw.Draw(image).text((8, 8), caption or "", "black", font_size=20, stroke_width=2, stroke_fill="white")
     return np.asarray(image)
 
 
@@ -528,41 +507,24 @@ def plot_learning_curve(path, tables, title, reward_threshold):
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     returns, losses, values = figure.subplots(1, 3)
-    steps = [row["step"] for row in tables["eval"]]
-    mean = np.array([row["average_return"] for row in tables["eval"]])
-    spread = np.array([row["std_return"] for row in tables["eval"]])
+    steps, mean, spread = [[row[name] for row in tables["eval"]] for name in ("step", "average_return", "std_return")]
     returns.plot(steps, mean, marker=".", label="deterministic policy, mean ± std")
-    returns.fill_between(steps, mean - spread, mean + spread, alpha=0.2)
+    returns.fill_between(steps, np.subtract(mean, spread), np.add(mean, spread), alpha=0.2)
     for row in tables["random"]:
         returns.axhline(row["average_return"], color="gray", linestyle=":", label="random policy")
     if reward_threshold is not None:
         returns.axhline(reward_threshold, color="green", linestyle="--", label="the task's threshold")
     returns.set(title=title, xlabel="gradient updates", ylabel="return")
     returns.legend(fontsize="small")
-    for axes, name, title in ((losses, "loss", "loss"), (losses, "critic_loss", "loss"), (values, "mean_q", "mean Q")):
+    for axes, name in ((losses, "loss"), (losses, "critic_loss"), (values, "mean_q")):
         rows = [row for row in tables["train"] if name in row]
         axes.plot([row["step"] for row in rows], [row[name] for row in rows])
-        axes.set(title=title, xlabel="gradient updates")
-    losses.set_yscale("log")
+    losses.set(title="loss", xlabel="gradient updates", yscale="log")
+    values.set(title="mean Q", xlabel="gradient updates")
     write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
 
 
 # A training run
-
-
-def say(line):
-    """Prints a line, above the progress bar."""
-    tqdm.write(line)
-    sys.stdout.flush()
-
-
-@contextlib.contextmanager
-def or_warn(what):
-    """Turns an exception into a printed warning."""
-    try:
-        yield
-    except Exception as error:
-        say(f"warning: no {what} ({first_line(error)})")
 
 
 def require_finite(module, step):
@@ -593,7 +555,7 @@ def stop_signals():
 
 
 class Tables:
-    """The tables of a run: lists of rows, dicts. Each is a CSV file, and each row is shown to TensorBoard."""
+    """Writes a run's tables, lists of rows (dicts): each is a CSV file, and each row is shown to TensorBoard."""
 
     def __init__(self, directory, tables):
         from torch.utils.tensorboard import SummaryWriter  # takes a second
@@ -602,18 +564,23 @@ class Tables:
         self.tables = tables
         self.writer = SummaryWriter(directory)
         for name, rows in tables.items():
-            if rows:
-                self._write_csv(name)
             for row in rows:
                 self._show(name, row)
+            if rows:
+                self._write(name)
 
     def add(self, name, row):
         """Adds a row. A CSV keeps the columns of its first row; later ones go to TensorBoard alone."""
         self.tables[name].append(row)
-        self._write_csv(name)
         self._show(name, row)
+        self._write(name)
 
-    def _write_csv(self, name):
+    def _show(self, name, row):
+        for column, value in row.items():
+            if column != "step" and math.isfinite(value):
+                self.writer.add_scalar(f"{name}/{column}", value, row["step"])
+
+    def _write(self, name):
         rows = self.tables[name]
         text = io.StringIO()
         writer = csv.DictWriter(text, rows[0], restval=math.nan, extrasaction="ignore", lineterminator="\n")
@@ -621,17 +588,12 @@ class Tables:
         writer.writerows(rows)
         write_atomically(self.directory / f"{name}.csv", lambda file: file.write(text.getvalue().encode()))
 
-    def _show(self, name, row):
-        for column, value in row.items():
-            if column != "step" and math.isfinite(value):
-                self.writer.add_scalar(f"{name}/{column}", value, row["step"])
-
 
 class Run:
-    """One training run: its worker processes, tables, checkpoints, evaluations, and the files at its end.
+    """One training run: its workers, tables, checkpoints, evaluations, and the files at its end.
 
     `evaluate(policy, env, seed)` plays one episode in a worker. The loop counts `env_steps`, the environment steps of
-    all environments and processes. Process 0 of torchrun's alone evaluates, writes and prints.
+    all environments and processes. Of torchrun's processes, number 0 alone evaluates, writes and prints.
     """
 
     SAVED = ("env_steps", "finished", "best", "snapshots", "tables")  # what a checkpoint has of these fields
@@ -642,17 +604,17 @@ class Run:
         self.config = config
         self.task = task
         self.evaluate_episode = evaluate
+        self.resume = resume
         self.rank, self.world_size, local_rank = processes
         self.device = select_device(config.device, local_rank)
-        if self.world_size > 1 and ":" in config.device:
-            raise InputError(f"--device {config.device}: several processes take a GPU each; use --device cuda")
+        if config.batch_size > min(config.initial_collect_steps, config.replay_buffer_capacity * self.world_size):
+            raise InputError(f"--batch-size {config.batch_size} is more than the transitions stored at first: use less")
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
-        if config.batch_size > min(config.initial_collect_steps, config.replay_buffer_capacity):
-            raise InputError(f"--batch-size {config.batch_size} is more than the transitions stored at first: use less")
-        self.resume = resume
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
         self.path = Path(resume or config.run_dir or Path("runs") / name)
+        # The config as plain values for files. The directory is not among them: a run may be moved.
+        self.plain_config = to_jsonable_python(dataclasses.asdict(config) | {"run_dir": None})
         self.env_steps = 0
         self.finished = []  # returns and lengths of the last ten training episodes that ended
         self.best = (-math.inf, None)  # return and weights of the best policy
@@ -668,7 +630,6 @@ class Run:
             size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
             self.pool = self.stack.enter_context(worker_pool(size, self.task))
             self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
-        keep_freed_memory()
         self.stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(self.config.num_threads)
         return self
@@ -687,10 +648,10 @@ class Run:
         self.stack.callback(self.progress.close)
         if self.rank == 0:
             self._begin_files()
-            say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {self.task.max_episode_steps} steps")
-            say(f"{self.world_size} process(es), {self.config.num_threads} CPU thread(s), device {self.device}")
-            say(f"run directory {self.path}")
-        if not checkpoint or checkpoint["config"] != plain_config(self.config):
+            limit = self.task.max_episode_steps
+            say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps")
+            say(f"{self.world_size} process(es), device {self.device}, run directory {self.path}")
+        if not checkpoint or checkpoint["config"] != self.plain_config:
             self.save(step)  # from here on --resume continues the run with these settings
         self.evaluate(0, policy=None)
         return step
@@ -706,8 +667,8 @@ class Run:
             for name, rows in own["replay"].items():
                 getattr(self.buffer, name)[: len(rows)] = rows
         except (AttributeError, RuntimeError, ValueError) as error:
-            what = first_line(error)
-            raise InputError(f"{self.path} does not fit this script's networks, optimizers, replay: {what}") from None
+            what = f"does not fit this script's networks, optimizers and replay ({first_line(error)})"
+            raise InputError(f"{self.path} {what}: continue it with the script that saved it") from None
         self.buffer.size = own["size"]
         self.buffer.position = own["position"]
         torch.set_rng_state(own["random"])
@@ -723,21 +684,21 @@ class Run:
             try:
                 self.path.mkdir(parents=True)
             except (OSError, ValueError) as error:
-                raise InputError(f"--run-dir {self.path} cannot be made ({first_line(error)}): name a new one") from None
-        text = to_json(plain_config(self.config), indent=2) + b"\n"
+                what = first_line(error)
+                raise InputError(f"--run-dir {self.path} cannot be made ({what}): name a new directory") from None
+        text = to_json(self.plain_config, indent=2) + b"\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
-            path.unlink()  # written anew from the checkpoint; left by a kill
+            path.unlink()  # of before: the tables are in the checkpoint, and a kill leaves temporary files
         self.table_files = Tables(self.path, self.tables)
 
     def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises FloatingPointError for bad weights."""
         buffer = self.buffer
-        replay = {}
+        own = {"replay": {}, "size": buffer.size, "position": buffer.position, "random": torch.get_rng_state()}
         for name, value in vars(buffer).items():
-            if torch.is_tensor(value) and len(value) == buffer.capacity:
-                replay[name] = value[: buffer.size].to("cpu", copy=True)
-        own = {"replay": replay, "size": buffer.size, "position": buffer.position, "random": torch.get_rng_state()}
+            if torch.is_tensor(value):  # (capacity, …)
+                own["replay"][name] = value[: buffer.size].to("cpu", copy=True)
         if self.device.type == "cuda":
             own["cuda_random"] = torch.cuda.get_rng_state(self.device)
         processes = [own] * self.world_size if self.rank == 0 else None
@@ -749,23 +710,19 @@ class Run:
         state = {name: getattr(self, name) for name in self.SAVED}
         state |= {"step": step, "seconds": time.perf_counter() - self.started, "processes": processes}
         state |= {"agent": self.agent.state_dict(), "optimizers": [each.state_dict() for each in self.agent.optimizers]}
-        self._write("policy.pt", "policy", {"weights": self._cpu_policy(self.agent.policy).state_dict()})
+        self._write("policy.pt", "policy", {"weights": cpu_copy(self.agent.policy).state_dict()})
         self._write("checkpoint.pt", "checkpoint", state)
 
     def _write(self, name, kind, state):
-        head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": plain_config(self.config)}
+        head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": self.plain_config}
         write_atomically(self.path / name, lambda file: torch.save(head | state, file))
-
-    @staticmethod
-    def _cpu_policy(policy):
-        return copy.deepcopy(policy).cpu().eval()
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
         self.finished = [*self.finished, (float(episode_return), int(length))][-10:]
 
     def log(self, step, metrics):
-        """Logs one update's `metrics`, scalar tensors, with recent episodes and the speed, every `log_interval` updates.
+        """Every `log_interval` updates: a row with the update's `metrics` (scalars), recent episodes and the speed.
 
         Raises FloatingPointError naming the step and the first metric that is not finite.
         """
@@ -777,17 +734,11 @@ class Run:
             if not math.isfinite(value):
                 raise FloatingPointError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
         last_step, then = self.last_logged
-        now = time.perf_counter()
-        self.last_logged = (step, now)
-        speed = (step - last_step) / (now - then)
-        returns = [episode_return for episode_return, _ in self.finished] or [math.nan]
-        lengths = [length for _, length in self.finished] or [math.nan]
-        row = {
-            "steps_per_second": speed,
-            "collect_return": float(np.mean(returns)),
-            "collect_episode_length": float(np.mean(lengths)),
-        }
-        self._add_row("train", step, row | values)
+        self.last_logged = (step, time.perf_counter())
+        speed = (step - last_step) / (time.perf_counter() - then)
+        mean_return, mean_length = np.mean(self.finished or [(math.nan, math.nan)], axis=0).tolist()
+        episodes = {"collect_return": mean_return, "collect_episode_length": mean_length}
+        self._add_row("train", step, {"steps_per_second": speed} | episodes | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
         say(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
@@ -800,36 +751,25 @@ class Run:
 
         The best policy so far is saved. A stop request ends this early: the run that continues does it again.
         """
-        name = "eval" if policy else "random"
-        if self.rank or any(row["step"] == step for row in self.tables[name][-1:]):
+        table = "eval" if policy else "random"
+        if self.rank or any(row["step"] == step for row in self.tables[table][-1:]):
             return
-        policy = policy and self._cpu_policy(policy)
+        policy = policy and cpu_copy(policy)
         file = self.scratch / "policy"
         file.write_bytes(pickle.dumps((self.evaluate_episode, policy)))
         episodes = [self.pool.submit(play_in_worker, file, seed) for seed in evaluation_seeds(self.config)]
-        if not self._finished_unless_stopped(episodes):
+        if not self._wait(episodes):
             return
         row, text = summarize([episode.result() for episode in episodes])
-        self._add_row(name, step, row)
-        if policy is None:
-            say(f"random policy: {text}")
-            return
-        say(f"step = {step}: {text}")
-        self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
-        require_finite(policy, step)
-        self._keep(step, row["average_return"], policy.state_dict())
+        self._add_row(table, step, row)
+        say(f"step = {step}: {text}" if policy else f"random policy: {text}")
+        if policy:
+            self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
+            require_finite(policy, step)
+            self._keep(step, row["average_return"], policy.state_dict())
 
-    def _keep(self, step, average_return, weights):
-        """Keeps the weights if they are the best so far, or one of the five in the film of how the policy learned."""
-        # At 0, 1/16, 1/4, 9/16 and all of the updates: most is learned at the beginning.
-        if step >= (len(self.snapshots) / 4) ** 2 * self.config.num_iterations:
-            self.snapshots.append((f"{step} updates: return {average_return:.1f}", weights))
-        if average_return > self.best[0]:
-            self.best = (average_return, weights)
-            self._write("best_policy.pt", "policy", {"weights": weights})
-
-    def _finished_unless_stopped(self, tasks):
-        """Waits for tasks of the workers, raises what one of them raised. False: a stop was requested before."""
+    def _wait(self, tasks):
+        """Waits for tasks of the workers and raises what one of them raised. False: a stop was requested before."""
         while tasks:
             if self.stop_request.is_set():
                 return False
@@ -837,6 +777,14 @@ class Run:
             for task in done:
                 task.result()
         return True
+
+    def _keep(self, step, average_return, weights):
+        """Keeps the best weights so far, and for a film those at 0, 1/16, 1/4, 9/16 and all of the updates."""
+        if step >= (len(self.snapshots) / 4) ** 2 * self.config.num_iterations:  # most is learned at the beginning
+            self.snapshots.append((f"{step} updates: return {average_return:.1f}", weights))
+        if average_return > self.best[0]:
+            self.best = (average_return, weights)
+            self._write("best_policy.pt", "policy", {"weights": weights})
 
     def stop_if_requested(self, step):
         """After Ctrl-C or SIGTERM: saves a checkpoint, tells how to continue, and raises KeyboardInterrupt.
@@ -856,12 +804,11 @@ class Run:
         if self.rank == 0:
             self.progress.close()
             self._plot()
-            path = str(self.path)
-            say(f"stopped at step {step}; to continue: --resume {shlex.quote(path)} (from Python: resume={path!r})")
+            say(f"stopped at step {step}; to continue: --resume '{self.path}' (in Python: resume={str(self.path)!r})")
         raise KeyboardInterrupt
 
     def finish(self, step, observation_shape):
-        """Saves and evaluates once more, draws the curve, exports and films the policies, says where everything lies."""
+        """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
         self.save(step)
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
@@ -869,40 +816,33 @@ class Run:
             return
         self.progress.close()
         self._plot()
-        policy = self._cpu_policy(self.agent.policy)
-        best = copy.deepcopy(policy)
-        best.load_state_dict(self.best[1])
+        policy = cpu_copy(self.agent.policy)
+        best = with_weights(policy, self.best[1])
         for name, each in (("policy.pt2", policy), ("best_policy.pt2", best)):
             with or_warn(name):
                 export_policy(self.path / name, each, observation_shape)
         if self.config.video:
-            self._film(policy)
-        self.stop_if_requested(step)
-        files = ", ".join(sorted(path.name for path in self.path.iterdir()))
-        say(f"finished; {self.path} holds {files}")
+            with or_warn("films"):
+                self._film(policy)
+        files = sorted(path.name for path in self.path.iterdir())
+        say(f"finished; {self.path} holds {', '.join(files)}")
 
     def _plot(self):
         title = f"{self.config.env_id}, seed {self.config.seed}"
-        with or_warn("learning_curve.png"):
-            plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
+        plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
 
     def _film(self, policy):
         say("filming the trained agent, a random one, and how it learned ...")
-        learning = []
-        for caption, weights in self.snapshots:
-            snapshot = copy.deepcopy(policy)
-            snapshot.load_state_dict(weights)
-            learning.append((snapshot, caption))
-        films = {
-            "learning.mp4": (learning, 4),
-            "trained_agent.mp4": ([(policy, None)], math.inf),
-            "random_agent.mp4": ([(None, None)], math.inf),
-        }
+        learning = [(with_weights(policy, weights), caption) for caption, weights in self.snapshots]
+        films = {"learning": learning, "trained_agent": [(policy, None)], "random_agent": [(None, None)]}
         seed = evaluation_seeds(self.config)[0]
-        with or_warn("films"):
-            tasks = []
-            for name, (clips, seconds) in films.items():
-                file = self.scratch / name
-                file.write_bytes(pickle.dumps(clips))
-                tasks.append(self.pool.submit(film_in_worker, file, seed, self.path.absolute() / name, seconds))
-            self._finished_unless_stopped(tasks)
+        tasks = []
+        for name, clips in films.items():
+            file = self.scratch / name
+            file.write_bytes(pickle.dumps(clips))
+            seconds = 4 if name == "learning" else math.inf
+            path = self.path.absolute() / f"{name}.mp4"
+            tasks.append(self.pool.submit(film_in_worker, file, seed, path, seconds))
+        if not self._wait(tasks):
+            say(f"stopped while filming; to film: --resume '{self.path}'")
+            raise KeyboardInterrupt

@@ -71,7 +71,7 @@ class Config:
     log_interval: PositiveInt = 200  # updates between rows of train.csv
     eval_interval: PositiveInt = 1_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 10  # episodes in each evaluation
-    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode: not too short
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode
 
     @model_validator(mode="after")
     def _finite_value(self):

@@ -78,7 +78,7 @@ class Config:
     log_interval: PositiveInt = 5_000  # updates between rows of train.csv
     eval_interval: PositiveInt = 10_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 20  # episodes per evaluation
-    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episodes: not too short
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episodes
 
 
 TUTORIAL = {
@@ -315,7 +315,7 @@ class SACAgent(nn.Module):
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
         actions, _ = self.actor.sample(self.scaled(observations))
         if not actions.isfinite().all():
-            raise FloatingPointError("the actor's actions are not finite: learning diverged; try smaller learning rates")
+            raise FloatingPointError("the actor's actions are not finite: learning diverged; try a smaller learning rate")
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch):
