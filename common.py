@@ -44,6 +44,7 @@ CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=Tr
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Task = Annotated[str, Field(pattern=r"^(\w[\w.]*:)?[^:]+$")]  # CartPole-v1, or my_module:MyTask-v0
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:[1-9]?\d)?)$")]
 Count = Annotated[int, Field(ge=1, le=1024)]  # of environments, of threads
 Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
@@ -218,8 +219,9 @@ def find_task(config, action_space):
     try:
         env = gym.make(config.env_id, max_episode_steps=config.max_episode_steps)
     except (gym.error.Error, ImportError) as error:
-        hint = "a package's task is written package:Task-v0, as highway_env:highway-v0"
-        raise InputError(f"{name} cannot be made: {first_line(error)} ({hint})") from None
+        unknown = isinstance(error, gym.error.UnregisteredEnv)
+        hint = " (a package's task is written package:Task-v0, as highway_env:highway-v0)" if unknown else ""
+        raise InputError(f"{name} cannot be made: {first_line(error)}{hint}") from None
     with env:
         require_spaces(name, env.observation_space, env.action_space, action_space)
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
@@ -528,9 +530,9 @@ def plot_learning_curve(path, tables, title, reward_threshold):
 
 
 def require_finite(module, step):
-    """Raises FloatingPointError, naming the first parameter that has a number which is not finite."""
-    for name, parameter in module.named_parameters():
-        if not parameter.isfinite().all():
+    """Raises FloatingPointError, naming the first parameter or buffer that has a number which is not finite."""
+    for name, tensor in module.state_dict().items():
+        if not tensor.isfinite().all():
             raise FloatingPointError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
 
 
@@ -690,6 +692,8 @@ class Run:
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
             path.unlink()  # of before: the tables are in the checkpoint, and a kill leaves temporary files
+        if self.best[1] is not None:
+            self._write("best_policy.pt", "policy", {"weights": self.best[1]})  # the file may be a later one's
         self.table_files = Tables(self.path, self.tables)
 
     def save(self, step):
@@ -822,8 +826,7 @@ class Run:
             with or_warn(name):
                 export_policy(self.path / name, each, observation_shape)
         if self.config.video:
-            with or_warn("films"):
-                self._film(policy)
+            self._film(policy)
         files = sorted(path.name for path in self.path.iterdir())
         say(f"finished; {self.path} holds {', '.join(files)}")
 
@@ -836,13 +839,15 @@ class Run:
         learning = [(with_weights(policy, weights), caption) for caption, weights in self.snapshots]
         films = {"learning": learning, "trained_agent": [(policy, None)], "random_agent": [(None, None)]}
         seed = evaluation_seeds(self.config)[0]
-        tasks = []
+        tasks = {}
         for name, clips in films.items():
             file = self.scratch / name
             file.write_bytes(pickle.dumps(clips))
             seconds = 4 if name == "learning" else math.inf
             path = self.path.absolute() / f"{name}.mp4"
-            tasks.append(self.pool.submit(film_in_worker, file, seed, path, seconds))
-        if not self._wait(tasks):
-            say(f"stopped while filming; to film: --resume '{self.path}'")
-            raise KeyboardInterrupt
+            tasks[name] = self.pool.submit(film_in_worker, file, seed, path, seconds)
+        for name, task in tasks.items():
+            with or_warn(f"{name}.mp4"):
+                if not self._wait([task]):
+                    say(f"stopped while filming; to film: --resume '{self.path}'")
+                    raise KeyboardInterrupt

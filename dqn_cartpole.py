@@ -43,7 +43,7 @@ warnings.filterwarnings("ignore", ".*environment CartPole-v0 is out of date", De
 class Config:
     """Deep Q-learning on CartPole. Values are the tutorial's unless a line says "ours"."""
 
-    env_id: str = "CartPole-v0"  # a gymnasium task with a Discrete action space
+    env_id: common.Task = "CartPole-v0"  # a gymnasium task with a Discrete action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 20_000  # gradient updates
     initial_collect_steps: PositiveInt = 100  # random steps before the first update

@@ -41,7 +41,7 @@ import common
 class Config:
     """Soft Actor-Critic on the Minitaur. Values are the tutorials' unless a line says "ours"."""
 
-    env_id: str = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
+    env_id: common.Task = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 100_000  # gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
@@ -565,8 +565,13 @@ class Simulator:
     """
 
     def __init__(self):
-        import pybullet  # here, so that other tasks train on machines without it
-        import pybullet_data
+        try:
+            import pybullet  # here, so that other tasks train on machines without it
+            import pybullet_data
+        except ImportError as error:
+            what = "the Minitaur needs pybullet, which has no wheel for Python 3.14 and newer"
+            hint = "uv run --python 3.13 --with-requirements requirements.txt sac_minitaur.py"
+            raise ImportError(f"{what}: {hint}") from error
 
         self.pybullet = pybullet
         self.client = pybullet.connect(pybullet.DIRECT)

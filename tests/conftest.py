@@ -23,7 +23,12 @@ def script(request):
 
 @pytest.fixture(scope="session")
 def reference(script, tmp_path_factory):
-    """An uninterrupted run with two environments; its directory, which no test changes."""
+    """A run that was left alone; its directory, which no test changes."""
     path = tmp_path_factory.mktemp(script)
-    finish(script, flags(script, path / "run", "--num-envs", 2), path / "output")
+    finish(script, [*flags(script, path / "run"), *several(script)], path / "output")
     return path / "run"
+
+
+def several(script):
+    """SAC's runs have three environments."""
+    return ["--num-envs", "3"] if script == "sac_minitaur" else []

@@ -8,7 +8,6 @@ with the script's module in the new process, before its `main`.
 import atexit
 import csv
 import importlib
-import io
 import os
 import pickle
 import signal
@@ -22,8 +21,11 @@ from unittest import mock
 ROOT = Path(__file__).parent.parent
 SCRIPTS = ("sac_minitaur", "dqn_cartpole")
 AGENTS = {"sac_minitaur": "SACAgent", "dqn_cartpole": "DQNAgent"}
-TASK = {"sac_minitaur": ["--env-id", "Pendulum-v1"], "dqn_cartpole": []}
-TINY = {"sac_minitaur": "--actor-layers 32 32 --critic-layers 32 32", "dqn_cartpole": "--layers 32"}
+# Short episodes: a checkpoint must let one end.
+TINY = {
+    "sac_minitaur": "--env-id Pendulum-v1 --max-episode-steps 30 --actor-layers 32 32 --critic-layers 32 32",
+    "dqn_cartpole": "--max-episode-steps 40 --layers 32",
+}
 COMMON = (
     "--device cpu --no-video --num-iterations 300 --initial-collect-steps 96 --batch-size 24 "
     "--replay-buffer-capacity 250 --log-interval 20 --eval-interval 100 --num-eval-episodes 2 --checkpoint-interval 50"
@@ -31,8 +33,8 @@ COMMON = (
 
 
 def flags(script, run_dir, *more):
-    """The command line of a tiny run. Its replay wraps around, and its checkpoints fall into episodes."""
-    return [*TASK[script], *TINY[script].split(), *COMMON.split(), "--run-dir", str(run_dir), *map(str, more)]
+    """The command line of a tiny run. Its replay wraps around, and its checkpoints cut episodes."""
+    return [*TINY[script].split(), *COMMON.split(), "--run-dir", str(run_dir), *map(str, more)]
 
 
 class Process:
@@ -42,9 +44,8 @@ class Process:
 
     def __init__(self, script, arguments, output, hook=None, **environ):
         if Process.server is None:
-            # A process that has touched a GPU cannot fork ones that use PyTorch's optimizers.
             environ_of_server = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
-            pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
             Process.server = subprocess.Popen([sys.executable, __file__], cwd=ROOT, env=environ_of_server, **pipes)
             atexit.register(Process.server.wait)
             atexit.register(Process.server.stdin.close)  # called first: it ends the server
@@ -92,11 +93,12 @@ def finish(script, arguments, output, hook=None):
 
 
 def read_command_line(script, *arguments):
-    """The config that these arguments of the script ask for."""
+    """What these arguments of the script ask for: config, directory to resume, policy to evaluate."""
     import common
 
+    module = importlib.import_module(script)
     with mock.patch.object(sys, "argv", [f"{script}.py", *map(str, arguments)]):
-        return common.read_command_line(importlib.import_module(script).Config, "")
+        return common.read_command_line(script, module.Config, module.TUTORIAL, "")
 
 
 def wait_until(condition, seconds=600):
@@ -183,10 +185,11 @@ def assert_same(a, b, where="checkpoint"):
     elif isinstance(a, torch.Tensor):
         assert a.dtype == b.dtype and torch.equal(a, b), where
     else:
-        assert a == b or a != a and b != b, where
+        assert a == b or (a != a and b != b), where
 
 
 def assert_same_run(run_dir, reference):
+    """Fails unless two runs have the same tables, checkpoint and policies, but for times."""
     import torch
 
     for name in ("train.csv", "eval.csv", "random.csv"):
@@ -201,10 +204,6 @@ def assert_same_run(run_dir, reference):
 
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def interrupt():
-    os.kill(os.getpid(), signal.SIGINT)
 
 
 def before_call(owner, name, count, action):
@@ -228,16 +227,12 @@ def _serve():
     requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     sys.path.insert(0, str(ROOT))
-    import matplotlib.figure
-    import torch
-    import tyro
+    import matplotlib.figure  # noqa: F401
     from torch.utils.tensorboard import SummaryWriter  # noqa: F401
 
-    # Done once, these import much and fill caches.
-    matplotlib.figure.Figure().savefig(io.BytesIO(), format="png")
-    torch.export.save(torch.export.export(torch.nn.Linear(1, 1), (torch.ones(2, 1),)), io.BytesIO())
     for script in SCRIPTS:
-        tyro.cli(importlib.import_module(script).Config, args=[])
+        read_command_line(script)
+    _start_forkserver()
     while True:
         try:
             request, argument = pickle.load(requests)
@@ -256,10 +251,22 @@ def _serve():
         replies.flush()
 
 
+def _start_forkserver():
+    """One server of workers for all runs, which would each start their own and import PyTorch in it."""
+    from multiprocessing import forkserver
+
+    import common
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    common.multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic", "pydantic.dataclasses"])
+    forkserver.ensure_running()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    forkserver._forkserver.ensure_running = lambda: None  # a forked run may not wait for a process that is not its child
+
+
 def _run(script, arguments, output, hook, environ):
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell started in the background
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored below nohup
     for descriptor, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(os.open(f"{output}/{name}", os.O_WRONLY | os.O_CREAT | os.O_APPEND), descriptor)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

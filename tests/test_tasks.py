@@ -1,113 +1,73 @@
-"""Tasks of one's own: how they fail, what they do to arrays, their bounds, types and time limits."""
+"""Tasks of one's own: their arrays, bounds, types, units, time limits, errors and films."""
 
-import multiprocessing
 import os
-import signal
+import re
 import subprocess
 import sys
-import threading
-import time
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
+import imageio
 import numpy as np
 import pytest
 import torch
 
 import common
+import dqn_cartpole
 import sac_minitaur
-from runs import Process, checkpoint, flags, load_policy, read_csv, wait_until
-from sac_minitaur import Config, Policy
-from test_sac import TINY, main, train
+from runs import ROOT, checkpoint, load_policy, read_csv, session, wait_until
+from test_input import main, refused
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:gymnasium")  # what it says of such tasks
-SHORT = dict(initial_collect_steps=40, num_iterations=20, replay_buffer_capacity=60, log_interval=20)
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:gymnasium", "ignore::DeprecationWarning:gymnasium")
+IMPORTED_BY = os.getpid()
 
 
 class Echo(gym.Env):
     """Observes the number of the step and the action just taken, and checks that the action is in its space."""
 
-    def __init__(self, low=-1, high=1, dtype=np.float32, in_place=False, fails=None, error=None, observations=None):
-        self.observation_space = observations or gym.spaces.Box(-np.inf, np.inf, (2,))
-        self.action_space = gym.spaces.Box(low, high, np.shape(low) or (1,), dtype)
-        self.in_place, self.fails, self.error = in_place, fails, error
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
+
+    def __init__(self, render_mode=None, low=-1, high=1, dtype=np.float32, discrete=False, fault=None, folder=None):
+        self.render_mode = render_mode
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+        self.action_space = gym.spaces.Discrete(2) if discrete else gym.spaces.Box(low, high, np.shape(low) or (1,), dtype)
+        self.fault = fault
+        self.folder = folder
         self.state = np.zeros(2, np.float32)
+        if folder:
+            Path(folder, f"{os.getpid()}-{id(self)}").touch()
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        assert torch.get_num_threads() == 1  # what a worker uses
-        if self.fails == "reset":
-            raise self.error()
+        if self.fault == "fork":
+            assert os.getpid() == IMPORTED_BY, "a library of this task works in no forked process"
+        if self.fault == "late space":
+            self.action_space = gym.spaces.Box(-1, 1, (1,))
+        if self.fault == "seed":
+            torch.manual_seed(42)
+        if self.fault == "reset":
+            raise ConnectionError("no server")
         self.state[:] = 0
         return self._observation(), {}
 
     def step(self, action):
         assert action in self.action_space, action
-        if self.fails == "step":
-            raise self.error()
         self.state += 1
-        self.state[1] = action[0]
-        if self.in_place:
+        self.state[1] = np.ravel(action)[0]
+        reward = {"nan": np.nan, "vector": np.ones(2)}.get(self.fault, float(self.state[0]))
+        if self.fault == "step" and self.state[0] == 3:
+            raise ConnectionError("no server")
+        if self.fault == "in place" and isinstance(action, np.ndarray):
             action[:] = 99
-        return self._observation(), float(self.state[0]), False, False, {}
+        step = self._observation(), reward, False, False, {}
+        return step[:3] + step[4:] if self.fault == "old gym" else step
 
     def _observation(self):
-        return self.state if self.in_place else self.state.copy()
+        return self.state if self.fault == "in place" else self.state.copy()
 
-
-class Unrepeatable(Echo):
-    """Its episodes end when something outside says so, which is not the same on resume. So with what it returns."""
-
-    length, error_of_rewards, error_of_observations = 50, 0, 0
-
-    def step(self, action):
-        observation, reward, *_ = super().step(action)
-        done = bool(self.state[0] >= self.length)
-        return observation + self.error_of_observations, reward + self.error_of_rewards, done, False, {}
-
-
-class Helped(gym.Wrapper):
-    """It starts a program, as a simulator that is a server, and a forked process. Both run until it ends them."""
-
-    def __init__(self, env_id):
-        super().__init__(gym.make(env_id))
-        self.program = subprocess.Popen(["sleep", "1000000"])
-        self.process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(10**6,))
-        self.process.start()
-
-    def step(self, action):
-        observation, *_ = self.env.step(action)
-        return observation, 1.0, False, False, {}  # its time limit alone ends an episode
-
-    def close(self):
-        ran = self.program.poll() is None and self.process.is_alive()
-        for each, wait in ((self.program, self.program.wait), (self.process, self.process.join)):
-            each.terminate()
-            wait()
-        assert ran
-
-
-class Wordless(Exception):
-    """It cannot tell its message, because of a fault in it."""
-
-    def __str__(self):
-        return self.message
-
-
-class TwoArguments(Exception):
-    """It cannot be made anew from its message, as pickle would."""
-
-    def __init__(self, code, text):
-        super().__init__(f"{text}: {code}")
-
-
-gym.register("Echo-v0", entry_point=Echo, max_episode_steps=4)
-gym.register("Endless-v0", entry_point=Echo)
-gym.register("HelpedBox-v0", entry_point=Helped, kwargs={"env_id": "Pendulum-v1"})
-gym.register("HelpedDiscrete-v0", entry_point=Helped, kwargs={"env_id": "CartPole-v1"})
-gym.register("Unrepeatable-v0", entry_point=Unrepeatable, max_episode_steps=100)
-IDS = {"env_id": f"{__name__}:Echo-v0"}
+    def render(self):
+        frames = {"float": np.zeros((32, 32, 3)), "none": None, "list": [np.zeros((32, 32, 3), np.uint8)]}
+        return frames.get(self.fault, np.full((32, 48, 3), 10 * self.state[0], np.uint8))
 
 
 @pytest.fixture
@@ -122,34 +82,41 @@ def register(monkeypatch):
     return register
 
 
-@pytest.mark.parametrize("high", [1, 3])  # the agent's actions themselves, or rescaled
-def test_arrays_that_a_task_changes_in_place(high, register, tmp_path):
-    path, _ = train(tmp_path / "run", **SHORT, env_id=register(high=high, in_place=True), num_envs=2)
-    own = checkpoint(path)["ranks"][0]
-    observations, actions, rewards, _, next_observations = own["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
-    assert torch.equal(next_observations[:, :1], observations[:, :1] + 1)
-    assert torch.equal(rewards, next_observations[:, :1])
+SHORT = {
+    "device": "cpu", "num_iterations": 20, "initial_collect_steps": 40, "batch_size": 16, "replay_buffer_capacity": 60,
+    "log_interval": 10, "eval_interval": 10, "checkpoint_interval": 10, "num_eval_episodes": 2, "video": False,
+}  # fmt: skip
+SMALL = {"sac_minitaur": {"actor_layers": (16,), "critic_layers": (16,)}, "dqn_cartpole": {"layers": (8,)}}
+MODULES = {"sac_minitaur": sac_minitaur, "dqn_cartpole": dqn_cartpole}
+
+
+def train(script, path, **choices):
+    module = MODULES[script]
+    return module.train(module.Config(**SHORT | SMALL[script] | {"run_dir": path} | choices))
+
+
+def test_arrays_that_a_task_changes_in_place(script, register, tmp_path):
+    """What is stored are copies, of observations and of the agent's own actions, in the order of the steps."""
+    num_envs = {"num_envs": 2} if script == "sac_minitaur" else {}
+    env_id = register(fault="in place", high=3, discrete=script == "dqn_cartpole")
+    path = train(script, tmp_path / "run", env_id=env_id, replay_buffer_capacity=1000, **num_envs)
+    replay = checkpoint(path)["processes"][0]["replay"]
+    observations, next_observations = replay["observations"], replay["next_observations"]
+    assert torch.equal(next_observations[:, 0], observations[:, 0] + 1)
+    assert torch.equal(replay["rewards"], next_observations[:, 0]) and not replay["terminated"].any()
     assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
-    torch.testing.assert_close(next_observations[:, 1:], actions if high == 1 else 1 + 2 * actions)
-    # Those of the running episodes, to be played again on resume.
-    assert all(len(actions) == 2 and actions.abs().max() <= 1 for _, actions in own["environments"]["episodes"])
-
-
-@pytest.mark.parametrize(
-    "dtype, low, high",
-    [(np.float32, -1, 0.2), (np.float64, -0.1, 0.7), (np.float16, -0.1, 0.7), (np.float16, -60000, 60000)],
-)
-def test_every_type_of_float_trains_evaluates_and_exports(dtype, low, high, register, tmp_path, monkeypatch, capsys):
-    env_id = register(dtype=dtype, low=low, high=high)
-    path, _ = train(tmp_path / "run", **SHORT, env_id=env_id)
-    capsys.readouterr()
-    assert main(monkeypatch, "--evaluate", path / "policy.pt") == 0  # of a run without videos: this one wants a film
-    output = capsys.readouterr().out
-    assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
-    assert "warning: no video (Echo.__init__() got an unexpected keyword argument 'render_mode'" in output
-    observations = torch.rand(5, 2)
-    exported = torch.export.load(path / "policy.pt2").module()(observations)
-    assert torch.equal(exported, load_policy(path / "policy.pt")(observations))
+    actions = replay["actions"].flatten()
+    torch.testing.assert_close(next_observations[:, 1], 1 + 2 * actions if script == "sac_minitaur" else actions)
+    step = 2 if num_envs else 1
+    same_episode = observations[step:, 0] > 0
+    assert torch.equal(observations[step:][same_episode], next_observations[:-step][same_episode])
+    assert len(actions[:40].unique()) == (40 if script == "sac_minitaur" else 2)  # random ones first
+    # Returns of 1 + 2 + 3 + 4, lengths of 4, of the last ten episodes that ended, and of the evaluations.
+    row = read_csv(path / "train.csv")[-1]
+    assert (row["collect_return"], row["collect_episode_length"]) == (10, 4)
+    rows = read_csv(path / "eval.csv")
+    assert {(row["average_return"], row["average_episode_length"]) for row in rows} == {(10, 4)}
+    assert [row["env_steps"] for row in rows] == [40, 40 + 10 * step, 40 + 20 * step]
 
 
 @pytest.mark.parametrize("dtype, scale", [(np.float32, 10), (np.float32, 3e38), (np.float64, 10), (np.float16, 6e4)])
@@ -158,303 +125,266 @@ def test_actions_never_leave_the_bounds(dtype, scale, register):
     low, high = np.sort(random.uniform(-scale, scale, (2, 300)).astype(dtype), axis=0)
     low[:2], high[:2] = (-1, 0.9 * scale), (0.2, scale)  # one rounding out, and an overflow of their sum
     space = gym.spaces.Box(low, high, dtype=dtype)
-    policy = Policy(Config(actor_layers=()), gym.spaces.Box(-1, 1, (1,)), space)
-    bounds = policy.low.clone()
-    policy.load_state_dict(policy.state_dict() | {"low": torch.full((300,), -1e9)})  # the task's own bounds stay
-    assert np.array_equal(space.low, low)
-    policy.load_state_dict(policy.state_dict() | {"low": bounds})
-    env = sac_minitaur.make_training_env(gym.spec(register(low=low, high=high, dtype=dtype)), False)
+    config = sac_minitaur.Config(actor_layers=())
+    policy = sac_minitaur.Policy(config, gym.spaces.Box(-1, 1, (1,)), space)
+    task = gym.spec(register(low=low, high=high, dtype=dtype))
+    env = sac_minitaur.make_training_env(task, False, os.getpid())
     env.reset()
     for sign in (-1, 1, 0.999, -1e-3):
         with torch.no_grad():
             policy.actor.net[0].weight.zero_()
             policy.actor.net[0].bias.fill_(np.arctanh(sign) if abs(sign) < 1 else 100 * sign)
         acted, forward = policy.act(np.zeros(1)), policy(torch.zeros(2, 1))[1].detach().numpy()
-        received = env.action(np.full(300, sign, np.float32))  # what its step gives to the task
-        env.step(np.full(300, sign, np.float32))  # which looks whether it is in its space
-        assert acted in space and received in space
-        assert (low <= forward).all() and (forward <= high).all()  # as policy.pt2 acts, in float32
+        env.step(np.full(300, sign, np.float32))  # the task looks whether it is in its space
+        assert acted in space and (low <= forward).all() and (forward <= high).all()  # as policy.pt2 acts, in float32
         exact = low.astype(float) + (high.astype(float) - low) * (1 + sign) / 2
-        tolerance = (1e-2 if dtype == np.float16 else 1e-5) * scale
-        for actions in (acted, received, forward):
-            np.testing.assert_allclose(actions, exact, rtol=0, atol=tolerance)
+        for actions in (acted, forward):
+            np.testing.assert_allclose(actions, exact, rtol=0, atol=(1e-2 if dtype == np.float16 else 1e-5) * scale)
     assert env.action_space == gym.spaces.Box(-1, 1, (300,))
 
 
-def test_a_task_without_a_time_limit_gets_one_and_says_so(tmp_path, capsys):
-    task = {"env_id": f"{__name__}:Endless-v0"}
-    assert common.find_task(Config(**task), gym.spaces.Box)[0].max_episode_steps == 10_000
-    path, _ = train(tmp_path / "run", **SHORT, **task, max_episode_steps=7)
-    assert "at most 7 steps (--max-episode-steps)" in capsys.readouterr().out
+@pytest.mark.parametrize("dtype, low, high", [(np.float64, -0.1, 0.7), (np.float16, -60000, 60000)])
+def test_unusual_floats_train_evaluate_and_export(dtype, low, high, register, tmp_path, monkeypatch, capsys):
+    path = train("sac_minitaur", tmp_path / "run", env_id=register(dtype=dtype, low=low, high=high))
+    capsys.readouterr()
+    assert main(monkeypatch, "--evaluate", path / "policy.pt") == 0  # of a run without videos: this one wants a film
+    output = capsys.readouterr().out
+    assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
+    assert "filmed one episode" in output and (path / "policy.mp4").exists()
+    observations = torch.rand(5, 2)
+    exported = torch.export.load(path / "policy.pt2").module()(observations)
+    assert torch.equal(exported, load_policy(path / "policy.pt")(observations))
+
+
+def test_a_task_without_a_time_limit_gets_one_and_says_so(script, register, tmp_path, capsys):
+    space = gym.spaces.Discrete if script == "dqn_cartpole" else gym.spaces.Box
+    env_id = register(limit=None, discrete=script == "dqn_cartpole")
+    config = MODULES[script].Config(env_id=env_id, checkpoint_interval=5)
+    assert common.find_task(config, space)[0].max_episode_steps == 10_000  # an interval may be shorter than ours
+    path = train(script, tmp_path / "run", env_id=env_id, max_episode_steps=7)
+    assert "at most 7 steps" in capsys.readouterr().out
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
-    assert common.find_task(Config(env_id="Pendulum-v1"), gym.spaces.Box)[0].max_episode_steps == 200
-    longer = Config(env_id="Pendulum-v1", max_episode_steps=300)
-    assert common.find_task(longer, gym.spaces.Box)[0].max_episode_steps == 300
 
 
-def test_a_task_that_wraps_another(register):
-    """With a function, which gymnasium finds unequal to its like in the spec of an environment made before."""
-
-    def make():
-        space = gym.spaces.Box(-99, 99, (3,))
-        return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda o: 2 * o, space)
-
-    task, observation_space, _ = common.find_task(Config(env_id=register(make, None)), gym.spaces.Box)
-    assert task.max_episode_steps == 200 and observation_space.high[0] == 99  # the limit of the one that is wrapped
-    with gym.make(task) as env:
-        assert env.observation_space == observation_space
+def test_workers_are_clean_and_make_the_task_once(script, register, tmp_path):
+    """A task on JAX hangs in a forked process. Only what the main process imported is here: in a fork it would differ."""
+    env_id = register(fault="fork", discrete=script == "dqn_cartpole", folder=str(tmp_path))
+    train(script, tmp_path / "run", env_id=env_id)
+    made = [path.name.split("-")[0] for path in tmp_path.glob("*-*")]
+    in_workers = [pid for pid in made if int(pid) != os.getpid()]
+    assert len(in_workers) == len(set(in_workers)) == (3 if script == "sac_minitaur" else 2)
 
 
-@pytest.mark.parametrize(
-    "kind, scale, layout",
-    [
-        (np.uint8, 1 / 4, lambda array: array[::-1].copy()[::-1]),
-        (np.int8, 200, lambda array: array.astype(">f4")),
-        (np.float16, 1e5, np.longdouble),
-        (np.float32, 1, list),
-    ],
-)
-def test_observations_are_stored_as_they_are_returned(kind, scale, layout, monkeypatch, register, tmp_path):
-    """In every layout, though the type of their space could not hold them."""
-    right = Echo._observation
-    monkeypatch.setattr(Echo, "_observation", lambda self: layout(scale * right(self)))
-    path, _ = train(tmp_path / "run", **SHORT, env_id=register(observations=gym.spaces.Box(0, 9, (2,), kind)))
-    rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
-    assert rows[:, 0].unique().tolist() == [0, scale, 2 * scale, 3 * scale]
+def test_a_space_that_reset_makes_is_seeded(script, register):
+    """Random actions are the same in every evaluation with a seed."""
+    with gym.make(register(fault="late space", limit=6)) as env:
+        task = gym.wrappers.TransformReward(env, lambda reward: reward + float(env.unwrapped.state[1]))
+        played = [MODULES[script].evaluate(None, task, seed) for seed in (3, 3, 4)]
+    assert played[0] == played[1] != played[2]
 
 
-@pytest.mark.parametrize("draw", [np.random.rand, torch.rand])
-def test_a_task_that_draws_from_a_librarys_own_generator_draws_anew_in_every_worker(draw, monkeypatch, tmp_path):
-    monkeypatch.setattr(Echo, "_observation", lambda self: np.asarray(draw(2)))
-    path, _ = train(tmp_path / "run", **SHORT, **IDS, num_envs=3)
-    rows = checkpoint(path)["ranks"][0]["buffer"]["rows"]
-    assert len(rows[:, 0].unique()) == len(rows)
+def test_a_task_that_seeds_the_global_generator_repeats_no_batch(register, tmp_path):
+    path = train("dqn_cartpole", tmp_path / "run", env_id=register(fault="seed", discrete=True), epsilon=1.0)
+    replay = checkpoint(path)["processes"][0]["replay"]
+    actions = replay["actions"].view(-1, 4)  # by episode
+    assert len(actions.unique(dim=0)) > 6
 
 
-@pytest.mark.parametrize("value", [np.nan, 1e39])  # which is too large for float32
-@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
-def test_a_task_that_returns_a_reward_that_is_not_finite(value, monkeypatch, tmp_path):
-    step = Echo.step
-    monkeypatch.setattr(Echo, "step", lambda *args: (step(*args)[0], value, False, False, {}))
-    said = r"the task failed: it returned the reward (nan|1e\+39) .*: not all finite"
-    with pytest.raises(common.TaskError, match=said):
-        train(tmp_path / "run", **SHORT, **IDS)
+def test_wrappers_that_learn_statistics_are_named(register, tmp_path, capsys):
+    make = gym.wrappers.NormalizeObservation
+    env_id = register(lambda: make(gym.make("Pendulum-v1")), limit=None)
+    common.find_task(sac_minitaur.Config(env_id=env_id), gym.spaces.Box)
+    assert "warning: each evaluation's NormalizeObservation starts anew" in capsys.readouterr().out
 
 
-SHAPE = "the task failed: it returned an observation of shape .* its space has "
-FINITE = "the task failed: it returned the reward .*inf.*: not all finite"
+FAULTS = {
+    "reset": ("ConnectionError: no server", "in reset\n"),
+    "step": ("ConnectionError: no server", "in step\n"),
+    "vector": ("Error: ", "WARN: The reward returned by `step()` must be a float"),
+    "old gym": ("ValueError: not enough values to unpack", "WARN: Core environment is written in old step API"),
+}
 
 
-@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
-@pytest.mark.parametrize(
-    "when, wrong, said",
-    [
-        (0, np.zeros(3), SHAPE),
-        (3, np.float32(0), SHAPE),
-        (3, np.zeros((1, 2)), SHAPE),
-        (0, np.full(2, 1e39), FINITE),
-        (3, np.full(2, np.inf), FINITE),
-    ],
-)
-def test_a_task_that_returns_what_no_space_of_its_has(when, wrong, said, monkeypatch, tmp_path):
-    right = Echo._observation
-    monkeypatch.setattr(Echo, "_observation", lambda self: wrong if self.state[0] == when else right(self))
-    with pytest.raises(common.TaskError, match=said):
-        train(tmp_path / "run", **SHORT, **IDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_error_of_the_task_ends_the_run_with_a_traceback(script, fault, tmp_path):
+    """Of the training process or a worker; gymnasium says what is wrong with a step. No process is left behind."""
+    kind = {"fault": fault, "discrete": script == "dqn_cartpole"}
+    (tmp_path / "broken_task.py").write_text(
+        f"import gymnasium\ngymnasium.register('Mine-v0', 'test_tasks:Echo', kwargs={kind}, max_episode_steps=4)"
+    )
+    paths = os.pathsep.join((str(tmp_path), str(ROOT), str(ROOT / "tests")))
+    command = [sys.executable, ROOT / f"{script}.py", "--env-id", "broken_task:Mine-v0", "--run-dir", tmp_path / "run"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, start_new_session=True, env=os.environ | {"PYTHONPATH": paths}, **pipes)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and all(text in errors for text in FAULTS[fault]), errors
+    wait_until(lambda: not session(process.pid), seconds=30)
 
 
-@pytest.mark.parametrize("error", [ConnectionError, partial(TwoArguments, 7), SystemExit, Wordless])
-@pytest.mark.parametrize("fails", ["reset", "step"])  # in an environment's worker, in an evaluation's
-def test_an_error_of_the_task_is_shown_with_its_own_traceback(fails, error, register, tmp_path, capsys):
-    with pytest.raises(common.TaskError) as caught:
-        train(tmp_path / "run", **SHORT, env_id=register(fails=fails, error=partial(error, "no server")))
-    text = str(caught.value)
-    assert caught.value.__cause__ is None  # which would show it a second time
-    assert "test_tasks.py" in text and f"in {fails}\n" in text and "died" not in text
-    assert ("exception str() failed" if error is Wordless else "no server") in text
-    assert ("Config(resume=" if fails == "step" else "there is no checkpoint yet") in capsys.readouterr().out
+RATES = {"sac_minitaur": {"critic_learning_rate": 1e30}, "dqn_cartpole": {"learning_rate": 1e30}}
 
 
-def test_the_first_line_of_an_error():
-    noted, syntax = ValueError("\nno server\nat all"), SyntaxError("invalid", ("task.py", 1, 1, "a b"))
-    noted.__notes__ = ["try again"]
-    errors = noted, syntax, ValueError(), Wordless()
-    assert [*map(common.first_line, errors)] == ["no server", "invalid (task.py, line 1)", "ValueError", "Wordless"]
+@pytest.mark.parametrize("log_interval, said", [(1, r"loss is (nan|inf) at step \d+;"), (10**6, r"is not finite")])
+def test_a_run_that_diverges_ends(script, log_interval, said, register, tmp_path):
+    """Before a checkpoint has such weights."""
+    choices = {"env_id": register(discrete=script == "dqn_cartpole"), "log_interval": log_interval, "num_iterations": 50}
+    with pytest.raises(FloatingPointError, match=f"{said}|the actor's actions are not finite"):
+        train(script, tmp_path / "run", **choices, **RATES[script])
+    for name in ("policy.pt", "best_policy.pt"):
+        assert all(weights.isfinite().all() for weights in load_policy(tmp_path / "run" / name).parameters())
+    assert all(tensor.isfinite().all() for tensor in checkpoint(tmp_path / "run")["agent"].values())
 
 
-def test_an_error_of_one_evaluation_episode_does_not_wait_for_the_others(monkeypatch, tmp_path):
-    failing, slow = common.evaluation_seeds(Config(**TINY))
-    reset = Echo.reset
-
-    def reset_by_seed(self, *, seed=None, options=None):
-        if seed == failing:
-            raise ValueError("no server")
-        if seed == slow:
-            time.sleep(20)
-            (tmp_path / "waited for").touch()
-        return reset(self, seed=seed)
-
-    monkeypatch.setattr(Echo, "reset", reset_by_seed)
-    with pytest.raises(common.TaskError, match="no server"):
-        train(tmp_path / "run", **SHORT, **IDS)
-    assert not (tmp_path / "waited for").exists()
-
-
-def test_ctrl_c_stops_the_run_and_nothing_that_its_task_has_started(script, tmp_path):
-    """A terminal sends it to all. What the task starts is there until the task ends it, and does not outlive the run.
-
-    It is in a worker, or with DQN in the training process.
-    """
-    task = f"{__name__}:Helped{'Box' if script == 'sac_minitaur' else 'Discrete'}-v0"
-    more = ["--num-iterations", 10**6, "--max-episode-steps", 20, "--eval-interval", 10**6]
-    run = Process(script, flags(script, tmp_path / "run", "--env-id", task, *more), tmp_path / "output")
-    wait_until((tmp_path / "run" / "train.csv").exists)
-    os.killpg(run.pid, signal.SIGINT)
-    assert run.wait() == 0 and "stopped at step" in run.stdout, run.stderr
-    assert run.stderr.count("stopping") == 1 and "Traceback" not in run.stderr
-
-
-def test_a_task_that_is_made_of_another(register, tmp_path):
-    """Once it has asked for the other one's spec, gymnasium takes that for its own."""
-
-    def make():
-        env = gym.make(IDS["env_id"])
-        return gym.wrappers.TransformReward(env, lambda reward: reward + 100 * env.spec.max_episode_steps)
-
-    path, _ = train(tmp_path / "run", **SHORT, env_id=register(make, limit=3))
-    _, _, rewards, _, _ = checkpoint(path)["ranks"][0]["buffer"]["rows"].split((2, 1, 1, 1, 2), dim=1)
-    assert rewards.unique().tolist() == [401, 402, 403]
-
-
-def test_a_task_that_cannot_be_copied(register, tmp_path):
-    """gymnasium then tells no spec. The time limit is the registered one."""
-    path, _ = train(tmp_path / "run", **SHORT, env_id=register(partial(lambda lock: Echo(), threading.Lock()), limit=3))
-    assert read_csv(path / "eval.csv")[-1]["average_episode_length"] == 3
-
-
-def test_an_error_in_a_tasks_module_or_constructor_keeps_its_traceback(register, monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "broken_module.py").write_text("1 / 0")
-    with pytest.raises(ZeroDivisionError):
-        main(monkeypatch, "--env-id", "broken_module:Task-v0")
-    for make, error in ((lambda: [].pop(), IndexError), (lambda: open(tmp_path / "map"), FileNotFoundError)):
-        with pytest.raises(error):
-            main(monkeypatch, "--env-id", register(make))
-
-
-@pytest.mark.parametrize(
-    "entry_point, kwargs", [(f"{__name__}:Missing", {}), ("Echo", {}), (lambda: None, {}), (Echo, {"nothing": 1})]
-)
-def test_a_task_that_gymnasium_cannot_make(entry_point, kwargs, register, monkeypatch, capsys):
-    assert main(monkeypatch, "--env-id", register(entry_point, **kwargs)) == 2
-    message = capsys.readouterr().err
-    assert message.startswith("error: --env-id Mine-v0 cannot be made: ") and message.count("\n") == 1
-
-
-def test_train_leaves_the_process_as_it_was(monkeypatch, tmp_path):
-    """A notebook's kernel draws with its own backend afterwards."""
-    monkeypatch.setitem(sys.modules, "ipykernel", None)
-    monkeypatch.setenv("MPLBACKEND", "agg")
-    handler = signal.getsignal(signal.SIGINT)
-    path, _ = train(tmp_path / "run", **SHORT, **IDS)
-    assert signal.getsignal(signal.SIGINT) == handler and os.environ["MPLBACKEND"] == "agg"
-    assert (path / "learning_curve.png").exists()
-
-
-def test_train_in_a_thread(tmp_path):
-    """It can be asked to stop in the main thread only."""
-    thread = threading.Thread(target=train, args=(tmp_path / "run",), kwargs=SHORT | IDS)
-    thread.start()
-    thread.join()
-    assert checkpoint(tmp_path / "run")["step"] == 20
-
-
-def test_a_task_that_changes_the_directory(register, monkeypatch, tmp_path):
-    """At its start and at every step. The run lies where the user asked, and the film."""
-
-    def make(render_mode=None):
-        os.chdir(tmp_path / "assets")
-        env = gym.make("Pendulum-v1", render_mode=render_mode)
-        return gym.wrappers.TransformReward(env, lambda reward: os.chdir(tmp_path / "assets") or reward)
-
-    (tmp_path / "assets").mkdir()
-    begin = common.Environments.__init__
-    monkeypatch.setattr(common.Environments, "__init__", lambda *args, **_: begin(*args, in_workers=False))
-    monkeypatch.chdir(tmp_path)
-    sac_minitaur.train(Config(**TINY | SHORT | {"env_id": register(make, 20), "run_dir": "run", "video": True}))
-    assert Path.cwd() == tmp_path / "assets"
-    monkeypatch.chdir(tmp_path)
-    assert main(monkeypatch, "--evaluate", "run/policy.pt") == 0
-    files = {path.name for path in (tmp_path / "run").iterdir()}
-    assert files > {"checkpoint.pt", "learning_curve.png", "policy.pt2", "trained_agent.mp4", "policy.mp4"}
-    assert not any((tmp_path / "assets").iterdir())
-
-
-def test_a_task_that_cannot_be_made_a_second_time(register, tmp_path):
-    once = iter([Echo()])
-
-    def make():
-        for env in once:
-            return env
-        raise ConnectionError("no second server")
-
-    with pytest.raises(common.TaskError, match="in make\n(.|\n)*no second server"):
-        train(tmp_path / "run", **SHORT, env_id=register(make))
-
-
-def test_a_config_takes_numpys_numbers_paths_and_lists(tmp_path, monkeypatch, capsys):
-    choices = dict(critic_learning_rate=np.float64(1e-3), seed=np.int64(3), actor_layers=[16], num_envs=np.int32(1))
-    config = Config(**TINY | SHORT | IDS | choices, run_dir=tmp_path / "run")
-    path = sac_minitaur.train(config)
-    assert main(monkeypatch, "--resume", path, "--num-iterations", 25) == 0
-    assert checkpoint(path)["step"] == 25
-    assert checkpoint(path)["config"]["seed"] == 3
-    again = Config(**TINY | SHORT | IDS | choices | {"num_iterations": 30}, resume=str(path))
-    assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 30
-    again = Config(resume=str(path), num_iterations=35)  # the rest is the run's
-    assert sac_minitaur.train(again) == path and checkpoint(path)["step"] == 35
-
-
-@pytest.mark.parametrize("change", [{"length": 5}, {"error_of_rewards": 1e-3}, {"error_of_observations": 1e-3}])
-def test_an_episode_that_cannot_be_played_again_on_resume(change, monkeypatch, tmp_path, capsys):
-    """The user is told."""
-    choices = SHORT | dict(env_id=f"{__name__}:Unrepeatable-v0", replay_buffer_capacity=200)
-    train(tmp_path / "run", **choices)
-    assert "warning" not in capsys.readouterr().out
-    for name, value in change.items():
-        monkeypatch.setattr(Unrepeatable, name, value)
-    train(tmp_path / "run", **choices | {"num_iterations": 40}, run_dir=None, resume=str(tmp_path / "run"))
-    assert "warning: an episode went differently" in capsys.readouterr().out
-    rows = checkpoint(tmp_path / "run")["ranks"][0]["buffer"]["rows"]
-    assert len(rows) == 40 + 40 and (rows[:, 5] > rows[:, 0]).all()  # no row leads from one episode into another
-
-
-@pytest.mark.parametrize("env_id", [IDS["env_id"], "MinitaurBulletEnv-v0"])
-@pytest.mark.parametrize("fault", [{"actor_learning_rate": 1e30}, {"critic_learning_rate": 1e30, "eval_interval": 1}])
-def test_a_diverged_actor_ends_the_run_in_one_line(env_id, fault, tmp_path):
-    if env_id == "MinitaurBulletEnv-v0":
-        pytest.importorskip("pybullet")
-    choices = SHORT | {"num_iterations": 200, "log_interval": 1000, "max_episode_steps": 20} | fault
-    with pytest.raises(common.RunError, match="the actor's actions are not finite") as caught:
-        train(tmp_path / "run", **choices, env_id=env_id)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_task_that_only_the_main_program_knows(tmp_path):
-    """Where workers are not forked, as in a notebook on a Mac: with entry points that only cloudpickle takes."""
-    (tmp_path / "program.py").write_text(f"""
+def test_a_task_that_only_the_main_program_knows(script, tmp_path):
+    """As in a notebook: its class is no module's, and the run is started without `if __name__`."""
+    kind = "PendulumEnv" if script == "sac_minitaur" else "CartPoleEnv"
+    choices = SHORT | SMALL[script] | {"run_dir": "run", "env_id": "Mine-v0", "max_episode_steps": 5}
+    program = f"""
 import gymnasium as gym
-import common, sac_minitaur
-if __name__ == "__main__":
-    from gymnasium.envs.classic_control import PendulumEnv
-    common.START_METHOD = "spawn"
-    gym.register("Base-v0", entry_point=lambda render_mode=None: PendulumEnv(render_mode))
-    gym.register("Mine-v0", entry_point=lambda **kwargs: gym.make("Base-v0", **kwargs), max_episode_steps=5)
-    choices = {TINY | SHORT} | dict(env_id="Mine-v0", num_eval_episodes=1, run_dir="run", video=True)
-    print(sac_minitaur.train(sac_minitaur.Config(**choices)))
-""")
-    paths = {"PYTHONPATH": str(Path(common.__file__).parent), "PATH": "", "SDL_VIDEODRIVER": "dummy"}
-    command = [sys.executable, "program.py"]
-    process = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
+from gymnasium.envs.classic_control import {kind}
+import {script}
+class Mine({kind}):
+    pass
+gym.register("Mine-v0", entry_point=Mine)
+print({script}.train({script}.Config(**{choices})))
+"""
+    command = [sys.executable, "-c", program]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert process.returncode == 0 and process.stdout.splitlines()[-1] == "run", process.stderr
-    assert (tmp_path / "run" / "trained_agent.mp4").exists(), process.stdout
+
+
+# Units: the observations of CartPole and Pendulum, times and plus a number
+
+
+class OtherUnits(gym.ObservationWrapper):
+    def __init__(self, env_id, factor, offset, bound, render_mode=None):
+        super().__init__(gym.make(env_id, render_mode=render_mode))
+        self.factor, self.offset = factor, offset
+        self.observation_space = gym.spaces.Box(-bound, bound, self.env.observation_space.shape)
+
+    def observation(self, observation):
+        return (self.factor * observation + self.offset).astype(np.float32)
+
+
+UNITS = {"times 1000": (1000, 0, np.inf), "bounds of 1e8": (1000, 0, 1e8), "plus 1000": (1, 1000, np.inf)}
+
+
+@pytest.mark.parametrize("units", UNITS)
+def test_dqn_learns_cartpole_in_other_units(units, register, tmp_path):
+    factor, offset, bound = UNITS[units]
+    env_id = register(OtherUnits, limit=None, env_id="CartPole-v0", factor=factor, offset=offset, bound=bound)
+    choices = {"seed": 1, "num_iterations": 4000, "eval_interval": 1000, "device": "cpu", "video": False}
+    path = dqn_cartpole.train(dqn_cartpole.Config(**choices, env_id=env_id, run_dir=tmp_path / "run"))
+    returns = [row["average_return"] for row in read_csv(path / "eval.csv")]
+    assert max(returns) >= 195, returns
+
+
+@pytest.mark.parametrize("seed", (0, 1))
+def test_dqn_learns_cartpole(seed, tmp_path):
+    """195 is the task's own threshold. A random policy stays 22 steps on average."""
+    choices = {"seed": seed, "num_iterations": 3000, "eval_interval": 500, "device": "cpu", "video": False}
+    path = dqn_cartpole.train(dqn_cartpole.Config(**choices, run_dir=tmp_path / "run"))
+    returns = [row["average_return"] for row in read_csv(path / "eval.csv")]
+    assert max(returns) >= 195, returns
+    assert read_csv(path / "random.csv")[0]["average_return"] < 60
+
+
+def test_sac_learns_pendulum(tmp_path):
+    choices = {
+        "env_id": "Pendulum-v1", "device": "cpu", "num_iterations": 3000, "initial_collect_steps": 1000,
+        "batch_size": 128, "actor_layers": (64, 64), "critic_layers": (64, 64), "log_interval": 1000,
+        "eval_interval": 3000, "checkpoint_interval": 3000, "num_eval_episodes": 10, "video": False,
+    }  # fmt: skip
+    path = sac_minitaur.train(sac_minitaur.Config(**choices, run_dir=tmp_path / "run"))
+    rows = read_csv(path / "eval.csv")
+    assert rows[0]["average_return"] < -700
+    assert rows[1]["average_return"] > -300  # a pendulum kept upright from the first swing on has about −150
+
+
+# Films and the console
+
+
+def film(path, clips, register, **kwargs):
+    register(limit=50, **kwargs)
+    common.film(clips, gym.spec("Mine-v0"), 0, path)
+    with imageio.get_reader(path) as video:
+        return video.get_meta_data(), [np.asarray(frame) for frame in video]
+
+
+def test_films_in_real_time_with_a_caption_for_each_policy(register, tmp_path):
+    data, frames = film(tmp_path / "film.mp4", [(None, None), (None, "a caption")], register)
+    assert data["fps"] == 50 and len(frames) == 2 * 26  # every second of 50 steps, and the last
+    assert frames[0].shape == (32, 48, 3) and np.abs(frames[12].mean() - 240) < 12 and frames[0].std() < 3
+    assert frames[26].std() > 10  # letters
+    assert not list(tmp_path.glob(".tmp-*"))
+
+
+@pytest.mark.parametrize("fault, found", [("float", "float64 (32, 32, 3)"), ("none", "NoneType"), ("list", "list")])
+def test_frames_that_cannot_be_filmed_cost_a_line(fault, found, register, tmp_path, capsys):
+    path = train("sac_minitaur", tmp_path / "run", env_id=register(fault=fault), video=True, num_iterations=1)
+    said = f"warning: no trained_agent.mp4 (the task's render returned {found}; needed: an array of uint8, (height, width, 3))"
+    assert said in capsys.readouterr().out and not list(path.glob("*.mp4")) + list(path.glob(".tmp*"))
+
+
+def test_what_a_terminal_shows(monkeypatch, capsys, register, tmp_path):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    path = train("dqn_cartpole", tmp_path / "run", env_id=register(discrete=True), video=True)
+    shown = capsys.readouterr()
+    assert "20/20" in shown.err and "return 10" in shown.err  # the progress bar
+    for line in (r"step = 20: loss = \S+, steps per second = \d+", r"step = 20: AverageReturn = .*"):
+        assert re.search(f"^{line}$", shown.out, re.MULTILINE), shown.out
+    assert {film.name for film in path.glob("*.mp4")} == {"learning.mp4", "trained_agent.mp4", "random_agent.mp4"}
+    assert [caption.split(":")[0] for caption, _ in checkpoint(path)["snapshots"]] == ["0 updates", "10 updates"]
+
+
+def test_output_in_any_encoding(script):
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, ROOT / f"{script}.py", "--help"]
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0 and "--run-dir" in process.stdout
+
+
+def test_exported_policies_run_without_this_project(script, reference, tmp_path):
+    batches = [torch.randn(size, 4 if script == "dqn_cartpole" else 3) for size in (1, 2, 300)]
+    torch.save(batches, tmp_path / "batches.pt")
+    code = """
+import sys, torch
+for name in ("policy", "best_policy"):
+    policy = torch.export.load(f"{sys.argv[1]}/{name}.pt2").module()
+    torch.save([policy(batch) for batch in torch.load("batches.pt")], f"{name}.pt")
+assert not {"sac_minitaur", "dqn_cartpole", "common", "gymnasium"} & set(sys.modules)
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    subprocess.run([sys.executable, "-c", code, reference], cwd=tmp_path, env=environment, check=True)
+    for name in ("policy.pt", "best_policy.pt"):
+        policy = load_policy(reference / name)
+        for batch, actions in zip(batches, torch.load(tmp_path / name), strict=True):
+            torch.testing.assert_close(actions, policy(batch).detach(), rtol=1e-6, atol=1e-6)
+        assert len(actions) == 300
+
+
+def test_the_policy_that_readme_films(monkeypatch, capsys, tmp_path):
+    pytest.importorskip("pybullet")
+    path = Path(tmp_path / "minitaur_policy.pt")
+    path.write_bytes((ROOT / "results" / "minitaur_policy.pt").read_bytes())
+    arguments = ["--evaluate", path, "--num-eval-episodes", 1, "--max-episode-steps", 50]
+    assert main(monkeypatch, *arguments) == 0
+    shown = re.search(r"AverageReturn = (\S+) .* = 50\.0", capsys.readouterr().out)
+    assert float(shown[1]) > 0.5  # standing still has 0
+    with imageio.get_reader(tmp_path / "minitaur_policy.mp4") as video:
+        frames = [np.asarray(frame) for frame in video]
+    assert len(frames) == 26 and frames[0].shape == (360, 480, 3)
+    assert np.abs(np.subtract(*np.float32([frames[0], frames[-1]]))).max() > 100  # the robot is seen, and moves
+
+
+def test_evaluation_episodes_are_none_of_trainings():
+    evaluation = set(common.evaluation_seeds(sac_minitaur.Config(num_eval_episodes=100)))
+    training = {common.derive_seed(0, env, update) for env in range(100) for update in range(100)}
+    training |= {common.derive_seed(0, env) for env in range(100)}
+    assert len(evaluation) == 100 and len(training) == 10_100 and not evaluation & training
+
+
+def test_a_wrong_task_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "NoSuchTask" in refused("dqn_cartpole", "--env-id", "NoSuchTask-v0") and not list(tmp_path.iterdir())
