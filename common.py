@@ -4,10 +4,13 @@ No loss and no replay buffer is here, and no training environment is stepped her
 """
 
 import argparse
+import atexit
 import contextlib
 import copy
 import csv
 import dataclasses
+import functools
+import gc
 import io
 import math
 import multiprocessing
@@ -36,8 +39,7 @@ from tqdm import tqdm
 
 FILE_FORMAT = 4  # of checkpoints and policies
 MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video")
-# Workers are clean processes. A fork of the main process would lack its threads, and break a task on JAX or CUDA.
-START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+START_METHOD = None  # of worker processes: fork, forkserver or spawn; None: see `start_method`
 
 # The types of the scripts' options
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
@@ -59,6 +61,7 @@ def run_main(main):
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="replace")  # a console without an α shows a question mark
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
+    atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
     try:
         main()
         return
@@ -277,7 +280,8 @@ class ObservationScaling(torch.nn.Module):
 
         Bounds that nobody reaches are dropped: scaled by them, all observations would come near one number. If one is
         over 130 times wider than the data, all over 10 times are dropped. CartPole has no such bound. A number without
-        bounds is centred and scaled by its data if these lie beyond ±10.
+        bounds is centred and scaled by its data if these lie beyond ±10. They then fill a quarter of [-1, 1], since
+        what a better policy sees lies farther out.
         """
         low = observations.amin(0)
         high = observations.amax(0)
@@ -290,7 +294,7 @@ class ObservationScaling(torch.nn.Module):
             self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
         self.center.copy_(torch.where(large, (low + high) / 2, self.center))
-        self.half_range.copy_(torch.where(large, spread, self.half_range))
+        self.half_range.copy_(torch.where(large, 4 * spread, self.half_range))
 
     def forward(self, observation):
         return (observation - self.center) / self.half_range
@@ -354,14 +358,31 @@ def average(tensors):
         tensor.copy_(total.view_as(tensor) / dist.get_world_size())
 
 
+def number_of_threads():
+    """The threads of this process, those of libraries too, on Linux."""
+    return len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
+
+
+THREADS_OF_IMPORTS = number_of_threads()
+
+
+def start_method():
+    """How to start workers: "fork", the quickest, while nothing has started threads in this process.
+
+    A fork lacks the threads. A task on JAX, CUDA or several threads of PyTorch would wait for them for ever.
+    """
+    if START_METHOD or sys.platform != "linux":
+        return START_METHOD or "spawn"
+    clean = number_of_threads() <= THREADS_OF_IMPORTS and "jax" not in sys.modules
+    return "fork" if clean else "forkserver"
+
+
 @contextlib.contextmanager
-def worker_pool(size, task):
-    """A pool of `size` processes that play `task`. They, and all that start until its end, are killed at its end."""
-    context = multiprocessing.get_context(START_METHOD)
-    if START_METHOD == "forkserver":
-        context.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once, for all workers
+def worker_pool(size):
+    """A pool of `size` processes. They, and all others that start until its end, are killed at its end."""
     others = set(multiprocessing.active_children())
-    pool = futures.ProcessPoolExecutor(size, context, prepare_worker, (cloudpickle.dumps(task),))
+    multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once for all workers
+    pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(start_method()), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a new process inherits
     for _ in range(size):
         pool.submit(int)  # starts a process
@@ -374,12 +395,10 @@ def worker_pool(size, task):
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-worker = {}  # in a process of the pool: its task, and the environment, made once
-
-
-def prepare_worker(task=None):
+def prepare_worker():
     """Prepares a worker process: Ctrl-C is the main process's, and it ends with that, even when that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: all workers begin with copies of the same
     torch.seed()
@@ -389,20 +408,24 @@ def prepare_worker(task=None):
         os._exit(1)
 
     threading.Thread(target=end_with_main_process, daemon=True).start()
-    if task is not None:
-        worker["task"] = pickle.loads(task)
-        worker["env"] = gym.make(worker["task"])
+
+
+@functools.cache
+def worker_environment(task):
+    """The environment of this worker, of a pickled task. It is made once: a simulator may take long to start."""
+    return gym.make(pickle.loads(task))
 
 
 def play_in_worker(file, seed):
-    """One episode in a worker: return and length. The file holds `evaluate` and the policy."""
-    evaluate, policy = pickle.loads(file.read_bytes())
-    return evaluate(policy, worker["env"], seed)
+    """One episode in a worker: return and length. The file holds `evaluate`, the pickled task and the policy."""
+    evaluate, task, policy = pickle.loads(file.read_bytes())
+    return evaluate(policy, worker_environment(task), seed)
 
 
 def film_in_worker(file, *arguments):
-    """A film made in a worker. The file holds the clips."""
-    film(pickle.loads(file.read_bytes()), worker["task"], *arguments)
+    """A film made in a worker. The file holds the clips and the pickled task."""
+    clips, task = pickle.loads(file.read_bytes())
+    film(clips, pickle.loads(task), *arguments)
 
 
 # Evaluation, films, the curve
@@ -598,13 +621,12 @@ class Run:
     all environments and processes. Of torchrun's processes, number 0 alone evaluates, writes and prints.
     """
 
-    SAVED = ("env_steps", "finished", "best", "snapshots", "tables")  # what a checkpoint has of these fields
+    SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # what a checkpoint has of these fields
 
-    def __init__(self, script, config, task, evaluate, resume=None, processes=(0, 1, 0)):
+    def __init__(self, script, config, evaluate, resume=None, processes=(0, 1, 0)):
         """Raises InputError for a config that cannot be used. Nothing is written yet."""
         self.script = script
         self.config = config
-        self.task = task
         self.evaluate_episode = evaluate
         self.resume = resume
         self.rank, self.world_size, local_rank = processes
@@ -619,6 +641,7 @@ class Run:
         self.plain_config = to_jsonable_python(dataclasses.asdict(config) | {"run_dir": None})
         self.env_steps = 0
         self.finished = []  # returns and lengths of the last ten training episodes that ended
+        self.metrics = {}  # the latest of each: an update may not return all
         self.best = (-math.inf, None)  # return and weights of the best policy
         self.snapshots = []  # captions and weights of five policies, for the film of how it learned
         self.tables = {"train": [], "eval": [], "random": []}
@@ -630,7 +653,7 @@ class Run:
         if self.rank == 0:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
             size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
-            self.pool = self.stack.enter_context(worker_pool(size, self.task))
+            self.pool = self.stack.enter_context(worker_pool(size))
             self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
         self.stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(self.config.num_threads)
@@ -639,8 +662,9 @@ class Run:
     def __exit__(self, *_):
         self.stack.close()
 
-    def begin(self, agent, buffer, checkpoint):
+    def begin(self, task, agent, buffer, checkpoint):
         """Restores the checkpoint, begins the files, evaluates random actions. Returns the number of updates done."""
+        self.task = task
         self.agent = agent
         self.buffer = buffer
         step = self._restore(checkpoint) if checkpoint else 0
@@ -731,9 +755,10 @@ class Run:
         Raises FloatingPointError naming the step and the first metric that is not finite.
         """
         self.progress.update()
+        self.metrics = self.metrics | metrics
         if self.rank or step % self.config.log_interval:
             return
-        values = {name: float(value) for name, value in metrics.items()}
+        values = {name: float(value) for name, value in self.metrics.items()}
         for name, value in values.items():
             if not math.isfinite(value):
                 raise FloatingPointError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
@@ -760,7 +785,7 @@ class Run:
             return
         policy = policy and cpu_copy(policy)
         file = self.scratch / "policy"
-        file.write_bytes(pickle.dumps((self.evaluate_episode, policy)))
+        file.write_bytes(pickle.dumps((self.evaluate_episode, cloudpickle.dumps(self.task), policy)))
         episodes = [self.pool.submit(play_in_worker, file, seed) for seed in evaluation_seeds(self.config)]
         if not self._wait(episodes):
             return
@@ -842,7 +867,7 @@ class Run:
         tasks = {}
         for name, clips in films.items():
             file = self.scratch / name
-            file.write_bytes(pickle.dumps(clips))
+            file.write_bytes(pickle.dumps((clips, cloudpickle.dumps(self.task))))
             seconds = 4 if name == "learning" else math.inf
             path = self.path.absolute() / f"{name}.mp4"
             tasks[name] = self.pool.submit(film_in_worker, file, seed, path, seconds)

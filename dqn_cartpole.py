@@ -321,14 +321,14 @@ def train(config, resume=None):
     Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "dqn_cartpole")
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
-    with common.Run("dqn_cartpole", config, task, evaluate, resume) as run:
+    with common.Run("dqn_cartpole", config, evaluate, resume) as run:
+        task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
         env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later
         torch.manual_seed(config.seed)
         agent = DQNAgent(config, observation_space, action_space, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, math.prod(observation_space.shape), run.device)
-        start = run.begin(agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
+        start = run.begin(task, agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
 
         if run.env_steps < config.initial_collect_steps:
             observation, _ = env.reset(seed=common.derive_seed(config.seed))

@@ -43,12 +43,13 @@ class Config:
 
     env_id: common.Task = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
-    num_iterations: PositiveInt = 100_000  # gradient updates
+    num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
     collect_steps_per_iteration: PositiveInt = 1  # steps of all environments for each update
-    num_envs: common.Count = 1  # environments that each process steps at once, each in a worker process of its own
+    num_envs: common.Count = 4  # ours (theirs: 1): environments stepped at once by each process, each in a worker
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
-    batch_size: PositiveInt = 256  # transitions per update, over all processes
+    batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
+    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): critics' updates for one of actor and α
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
@@ -62,7 +63,7 @@ class Config:
     time_limit_terminates: bool = False  # ours (theirs: yes): a time limit counts as an end of the task
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.005  # ours (theirs: 1): policy ← policy + τ (actor − policy) per update
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): policy ← policy + τ (actor − policy)
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
     target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each dimension of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
@@ -82,6 +83,10 @@ class Config:
 
 
 TUTORIAL = {
+    "num_iterations": 100_000,
+    "num_envs": 1,
+    "batch_size": 256,
+    "actor_update_interval": 1,
     "replay_buffer_capacity": 10_000,
     "actor_learning_rate": 3e-4,
     "critic_learning_rate": 3e-4,
@@ -315,23 +320,28 @@ class SACAgent(nn.Module):
         observations = torch.as_tensor(observations, dtype=torch.float32, device=self.device)
         actions, _ = self.actor.sample(self.scaled(observations))
         if not actions.isfinite().all():
-            raise FloatingPointError("the actor's actions are not finite: learning diverged; try a smaller learning rate")
+            raise FloatingPointError("the actor's actions are not finite: learning diverged; lower its rates")
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
-    def update(self, batch):
-        """One gradient step of the critics, then of the actor and α. Policy and target critics follow.
+    def update(self, batch, step):
+        """Update number `step`, from 0: a gradient step of the critics, at every few also of the actor and α.
 
         `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: `.item()`
         here would make the CPU wait for the GPU.
         """
+        metrics = self.update_critics(batch)
+        if step % self.config.actor_update_interval == 0:  # ours; in the paper always
+            metrics = metrics | self.update_actor(batch)
+        return metrics
+
+    def update_critics(self, batch):
+        """Q(s, a) moves to y = r + γ (1 − terminated) (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s')."""
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, S), (B, A), (B,), (B,), (B, S); the actor uses O of S
         s = self.scaled(s)
         next_s = self.scaled(next_s)
         rewards = self.reward_scale * rewards
         alpha = self.log_alpha.detach().exp()
-
-        # The critics: Q(s, a) moves to y = r + γ (1 − terminated) (min Q(s', a') − α log π(a'|s')), a' ~ π(·|s').
         with torch.no_grad():
             next_a, next_log_probs = self.actor.sample(next_s)  # (B, A), (B,)
         if not config.critic_batch_norm:  # as in the paper
@@ -345,38 +355,37 @@ class SACAgent(nn.Module):
             self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
-        loss_q = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
+        loss = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
+
         self.critic_optimizer.zero_grad()
-        loss_q.backward()
+        loss.backward()
         # Several processes: the mean of their gradients, and of batch normalization's running statistics.
         statistics = [buffer for buffer in self.critics.buffers() if buffer.is_floating_point()]
         common.average([*(parameter.grad for parameter in self.critics.parameters()), *statistics])
         self.critic_optimizer.step()
+        if not config.critic_batch_norm:  # the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
+            soft_update(self.target_critics, self.critics, config.target_update_tau)
+        return {"critic_loss": loss.detach(), "mean_q": q.detach().mean(), "alpha": alpha}
 
-        # The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s).
+    def update_actor(self, batch):
+        """The actor lowers α log π(a|s) − min Q(s, a), with a ~ π(·|s). α falls while the entropy is too high."""
+        s = self.scaled(batch[0])  # (B, S)
+        alpha = self.log_alpha.detach().exp()
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
         self.critics.requires_grad_(False)  # the loss passes through the critics; they keep their weights
-        loss_pi = actor_loss(log_probs, self.critics(s, new_a), alpha)
-        self.actor_optimizer.zero_grad()
-        loss_pi.backward()
-        common.average(parameter.grad for parameter in self.actor.parameters())
-        self.actor_optimizer.step()
-        self.critics.requires_grad_(True)
-
-        # α falls while the entropy is above its target, and rises below it.
+        loss = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
+
+        self.actor_optimizer.zero_grad()
+        loss.backward()
         self.alpha_optimizer.zero_grad()
         loss_alpha.backward()
-        common.average([self.log_alpha.grad])
+        common.average([*(parameter.grad for parameter in self.actor.parameters()), self.log_alpha.grad])
+        self.actor_optimizer.step()
         self.alpha_optimizer.step()
-
-        # The policy's actor and the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
-        soft_update(self.policy.actor, self.actor, config.averaged_actor_tau)
-        if not config.critic_batch_norm:
-            soft_update(self.target_critics, self.critics, config.target_update_tau)
-        metrics = {"critic_loss": loss_q, "actor_loss": loss_pi, "alpha_loss": loss_alpha, "alpha": alpha}
-        metrics |= {"entropy": -log_probs.mean(), "mean_q": q.mean()}
-        return {name: value.detach() for name, value in metrics.items()}
+        self.critics.requires_grad_(True)
+        soft_update(self.policy.actor, self.actor, self.config.averaged_actor_tau)  # the policy's actor follows
+        return {"actor_loss": loss.detach(), "alpha_loss": loss_alpha.detach(), "entropy": -log_probs.detach().mean()}
 
 
 @torch.no_grad()
@@ -388,8 +397,8 @@ def soft_update(target, source, tau):
         slow.copy_(buffer)  # running statistics, if you give the actor batch normalization
 
 
-def cuda_graph(agent):
-    """`agent.update` for --cuda-graph: its third call is recorded as a CUDA graph, which this and later calls replay.
+def cuda_graph(agent, function):
+    """For --cuda-graph: `function(batch)` of the agent, of which the third call is recorded, and replayed from then on.
 
     Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. A recorded
     update repeats the same operations: leave --cuda-graph out when your update has an `if` on data.
@@ -402,18 +411,18 @@ def cuda_graph(agent):
     recorded = None
     metrics = None
 
-    def update(batch):
+    def replay(batch):
         nonlocal calls, recorded, metrics
         calls += 1
         if calls < 3:  # they make Adam's state and load what CUDA needs, which must not be recorded
-            return agent.update(batch)
+            return function(batch)
         if calls == 3:
             groups = [group for optimizer in agent.optimizers for group in optimizer.param_groups]
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
             recorded = batch
             with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # computes nothing, replays do
-                metrics = agent.update(recorded)
+                metrics = function(recorded)
             for group in groups:
                 group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
         for graph_input, values in zip(recorded, batch):
@@ -421,7 +430,7 @@ def cuda_graph(agent):
         graph.replay()
         return metrics  # the next replay overwrites them
 
-    return update
+    return replay
 
 
 def evaluate(policy, env, seed):
@@ -467,7 +476,7 @@ def make_vector_env(task, config):
     """`num_envs` environments (K), each in a worker process. One whose episode has ended resets itself at once."""
     make = partial(make_training_env, task, config.privileged_critics, os.getpid())
     return gym.vector.AsyncVectorEnv(
-        [make] * config.num_envs, context=common.START_METHOD, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
+        [make] * config.num_envs, context=common.start_method(), autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
     )
 
 
@@ -497,18 +506,20 @@ def train(config, resume=None):
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
     processes = common.join_processes()  # of torchrun: rank, number of processes, rank on this machine
     rank, world_size, _ = processes
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
-    with common.Run("sac_minitaur", config, task, evaluate, resume, processes) as run:
+    with common.Run("sac_minitaur", config, evaluate, resume, processes) as run:
+        task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
         run.stack.callback(envs.close, terminate=True)  # where the run fails
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
-        update_agent = cuda_graph(agent) if config.cuda_graph else agent.update
+        if config.cuda_graph:
+            agent.update_critics = cuda_graph(agent, agent.update_critics)
+            agent.update_actor = cuda_graph(agent, agent.update_actor)
         torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process
         numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process's environments
-        start = run.begin(agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
+        start = run.begin(task, agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
 
         if run.env_steps < config.initial_collect_steps:
             observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in numbers])
@@ -534,7 +545,8 @@ def train(config, resume=None):
             # The update learns from the steps before this one, while the simulators work.
             actions = agent.act(observations)
             envs.step_async(actions)
-            metrics = update_agent(buffer.sample(config.batch_size // world_size))  # this process's share of the batch
+            batch = buffer.sample(config.batch_size // world_size)  # this process's share of the batch
+            metrics = agent.update(batch, update)
             observations = store(buffer, observations, actions, envs.step_wait(), run)
             run.log(update + 1, metrics)  # a row every log_interval updates
 

@@ -2,7 +2,7 @@
 # multiprocessing's forkserver: set_forkserver_preload quietly does nothing for a module beside
 # the main script, when the program is started from another folder.
 #
-# Who meets it: somebody who preloads a slow module of his own (networks, a robot model) for the
+# Who meets it: somebody who preloads a slow module of their own (networks, a robot model) for the
 # actor processes, and starts training with "python project/train.py" or from a scheduler.
 #
 # The guess: what the main script can import, the forkserver can import too. If it can not,

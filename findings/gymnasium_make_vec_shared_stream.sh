@@ -4,8 +4,7 @@
 #
 # Who meets it: somebody who moves from SyncVectorEnv to make_vec and keeps the seed.
 #
-# The guess: environment i is seeded with seed + i, as in SyncVectorEnv. Environment 0 starts
-# like a single environment with this seed, and does not depend on its neighbours.
+# The guess: environment i gets seed + i, as in SyncVectorEnv, and needs no neighbour.
 #
 # The behaviour: without a vectorization_mode, make_vec picks the special CartPoleVectorEnv.
 # It has one generator for all. Environment 0 of two starts in another place, and its second

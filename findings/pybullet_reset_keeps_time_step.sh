@@ -11,7 +11,7 @@
 # step stays at 0.01. A ball that falls for 240 steps then falls 2.4 s instead of 1 s. A new
 # connection does have the default.
 #
-# Seen on 2026-11-28 with Python 3.11.7 and pybullet 3.2.7:
+# Seen on 2026-11-28 with Python 3.11.7, pybullet 3.2.7, numpy 2.4.6:
 #   fresh connection:      time step 0.004167, gravity 0.0, solver iterations 50, ball falls 4.66 m
 #   changed settings:      time step 0.010000, gravity -5.0, solver iterations 7
 #   after resetSimulation: time step 0.010000, gravity 0.0, solver iterations 50, ball falls 21.42 m
@@ -21,7 +21,7 @@ set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 python3 -m venv "$work/venv"
-"$work/venv/bin/pip" install -qq --no-compile --disable-pip-version-check pybullet==3.2.7
+"$work/venv/bin/pip" install -qq --no-compile --disable-pip-version-check pybullet==3.2.7 numpy==2.4.6
 
 cat > "$work/show.py" <<'PY'
 import platform
@@ -50,7 +50,7 @@ def world(label):
     return values, round(fall, 1)
 
 
-print("Python", platform.python_version(), "pybullet", version("pybullet"))
+print("Python", platform.python_version(), "pybullet", version("pybullet"), "numpy", version("numpy"))
 p.connect(p.DIRECT)
 fresh = world("fresh connection:")
 p.setTimeStep(0.01)

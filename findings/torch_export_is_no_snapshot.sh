@@ -1,6 +1,5 @@
 #!/usr/bin/env bash
-# torch.export.export does not freeze the weights: the exported program changes as the
-# training goes on.
+# torch.export.export freezes no weights: the exported program changes as training goes on.
 #
 # Who meets it: somebody who exports the policy at its best evaluation, trains on, and saves
 # the exported program at the end of the run. The file then holds the last weights.
@@ -8,9 +7,8 @@
 # The guess: an exported program is a finished thing, a snapshot of the network.
 #
 # The behaviour: it shares its weights, buffers and plain tensor attributes with the living
-# network. A change in place (an optimizer step is one) changes the program too. Only Python
-# numbers are frozen. So one program can mix old and new values. Only torch.export.save
-# makes the snapshot.
+# network. A change in place (an optimizer step is one) changes the program too. Python
+# numbers are frozen, so one program mixes old and new. torch.export.save makes a snapshot.
 #
 # Seen on 2026-11-28 with Python 3.11.7 and torch 2.13.0+cpu:
 #   at the export                 network 1.0, program 1.0

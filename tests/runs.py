@@ -23,7 +23,7 @@ SCRIPTS = ("sac_minitaur", "dqn_cartpole")
 AGENTS = {"sac_minitaur": "SACAgent", "dqn_cartpole": "DQNAgent"}
 # Short episodes: a checkpoint must let one end.
 TINY = {
-    "sac_minitaur": "--env-id Pendulum-v1 --max-episode-steps 30 --actor-layers 32 32 --critic-layers 32 32",
+    "sac_minitaur": "--num-envs 1 --env-id Pendulum-v1 --max-episode-steps 30 --actor-layers 32 32 --critic-layers 32 32",
     "dqn_cartpole": "--max-episode-steps 40 --layers 32",
 }
 COMMON = (
@@ -232,7 +232,6 @@ def _serve():
 
     for script in SCRIPTS:
         read_command_line(script)
-    _start_forkserver()
     while True:
         try:
             request, argument = pickle.load(requests)
@@ -249,19 +248,6 @@ def _serve():
             reply = os.waitstatus_to_exitcode(status) if pid else None
         pickle.dump(reply, replies)
         replies.flush()
-
-
-def _start_forkserver():
-    """One server of workers for all runs, which would each start their own and import PyTorch in it."""
-    from multiprocessing import forkserver
-
-    import common
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    common.multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic", "pydantic.dataclasses"])
-    forkserver.ensure_running()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    forkserver._forkserver.ensure_running = lambda: None  # a forked run may not wait for a process that is not its child
 
 
 def _run(script, arguments, output, hook, environ):

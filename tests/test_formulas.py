@@ -188,7 +188,7 @@ def test_bounds_that_nobody_reaches_are_dropped():
     """One of ±1e8 makes all over ten times wider than the data suspect. ±2 of the third stay."""
     data = [[0.2, 300.0, -0.5], [-0.3, -300, 0.5]]
     scaling = fitted([-35, -1e8, -2], [35, 1e8, 2], data)
-    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 1])), torch.tensor([2.0, 2, 0.5]))
+    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 1])), torch.tensor([2.0, 0.5, 0.5]))
     scaling = fitted([-30, -2], [30, 2], [[0.25, 1.0], [-0.25, -1]])  # within 130 times
     assert scaling(torch.tensor([15.0, 1])).tolist() == [0.5, 0.5]
 
@@ -196,7 +196,7 @@ def test_bounds_that_nobody_reaches_are_dropped():
 def test_numbers_without_bounds_are_scaled_only_beyond_ten():
     inf = np.inf
     scaling = fitted([-inf] * 4, [inf] * 4, [[1000.0, -3, 30000, 5000], [1002, 9, 30100, 5000]])
-    assert scaling(torch.tensor([1002.0, 9, 30050, 5001])).tolist() == [1, 9, 0, 1]
+    assert scaling(torch.tensor([1002.0, 9, 30050, 5001])).tolist() == [0.25, 9, 0, 0.25]
 
 
 # SAC
@@ -369,7 +369,7 @@ def test_sac_update(batch_norm):
                 parameter -= learning_rate * gradient / (gradient.abs() + config.adam_epsilon)
 
     torch.manual_seed(5)
-    metrics = agent.update(batch)
+    metrics = agent.update(batch, 0)
 
     torch.manual_seed(5)
     with torch.no_grad():
@@ -419,9 +419,23 @@ def test_sac_update(batch_norm):
         assert not torch.equal(own, before) and own.grad is None
 
 
+def test_actor_and_alpha_are_updated_at_every_few_updates():
+    agent = sac_agent(actor_update_interval=3, averaged_actor_tau=0.5)
+    moved = []
+    for step in range(7):
+        before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
+        metrics = agent.update(sac_batch(), step)
+        changed = {name for name, tensor in agent.state_dict().items() if not torch.equal(tensor, before[name])}
+        assert "critics.q1.1.weight" in changed and "critic_loss" in metrics
+        others = {"actor.net.0.weight", "log_alpha", "policy.actor.net.0.weight"}
+        assert others <= changed and "actor_loss" in metrics or not (others & changed or "actor_loss" in metrics)
+        moved.append("log_alpha" in changed)
+    assert moved == [True, False, False, True, False, False, True]
+
+
 def test_only_the_critics_see_the_end_of_a_longer_observation():
     agent = sac_agent(observation_size=3, state_size=5)
-    agent.update(sac_batch(state_size=5))
+    agent.update(sac_batch(state_size=5), 0)
     observations = torch.randn(4, 5)
     others = torch.cat((observations[:, :3], torch.randn(4, 2)), dim=1)
     torch.manual_seed(7)
@@ -503,7 +517,7 @@ def test_an_update_reads_and_creates_nothing_on_another_device(monkeypatch, tuto
     meta = torch.device("meta")
     agent = sac_agent(device=meta, state_size=5, **(sac_minitaur.TUTORIAL if tutorial else {}))
     batch = tuple(tensor.to(meta) for tensor in sac_batch(state_size=5))
-    assert {value.device for value in agent.update(batch).values()} == {meta}
+    assert {value.device for value in agent.update(batch, 0).values()} == {meta}
     agent = dqn_agent(**(dqn_cartpole.TUTORIAL if tutorial else {})).to(meta)
     batch = tuple(tensor.to(meta) for tensor in dqn_batch())
     assert {value.device for value in agent.update(batch, 0).values()} == {meta}
@@ -521,6 +535,6 @@ def test_an_update_on_the_gpu_is_that_of_the_cpu(monkeypatch, tutorial):
     for agent in agents:
         draws = iter(noise)
         monkeypatch.setattr(torch, "randn_like", lambda mean, draws=draws: next(draws).to(mean.device))
-        metrics = agent.update(tuple(tensor.to(agent.device) for tensor in sac_batch(state_size=5)))
+        metrics = agent.update(tuple(tensor.to(agent.device) for tensor in sac_batch(state_size=5)), 0)
         results.append({name: value.cpu() for name, value in (metrics | agent.state_dict()).items()})
     torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-5)

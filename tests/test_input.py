@@ -27,7 +27,8 @@ TUTORIALS = {
         "actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4, "alpha_learning_rate": 3e-4, "adam_beta1": 0.9,
         "privileged_critics": False, "critic_batch_norm": False, "reward_scaling": False, "reward_scale_factor": 1,
         "averaged_actor_tau": 1, "target_entropy_per_action": -0.5, "replay_buffer_capacity": 10_000,
-        "time_limit_terminates": True,
+        "time_limit_terminates": True, "num_iterations": 100_000, "num_envs": 1, "batch_size": 256,
+        "actor_update_interval": 1,
     },
     "dqn_cartpole": {
         "learning_rate_decay": None, "gamma": 1, "target_update_tau": 1, "value_unit": False, "advantage_learning": 0,

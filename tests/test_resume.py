@@ -261,7 +261,7 @@ def test_a_second_ctrl_c_stops_at_once(script, tmp_path):
 def test_no_process_outlives_a_killed_main_process(script, tmp_path):
     process = start(script, *long_flags(script, tmp_path / "run"))
     wait_until((tmp_path / "run" / "train.csv").exists)
-    assert len(session(process.pid)) >= 4  # workers, their server, what cleans up behind it
+    assert len(session(process.pid)) >= 3  # workers of evaluation, and the environments
     process.kill()
     process.communicate(timeout=60)
     nothing_is_left(process)
