@@ -194,18 +194,6 @@ def export_policy(path, policy, observation_shape):
     write_atomically(path, lambda file: torch.export.save(program, file))
 
 
-def cpu_copy(policy):
-    """A copy of a policy for evaluation, on the CPU."""
-    return copy.deepcopy(policy).cpu().eval()
-
-
-def with_weights(policy, weights):
-    """A copy of a policy with other weights."""
-    other = copy.deepcopy(policy)
-    other.load_state_dict(weights)
-    return other
-
-
 # Tasks, seeds, devices
 
 
@@ -358,12 +346,7 @@ def average(tensors):
         tensor.copy_(total.view_as(tensor) / dist.get_world_size())
 
 
-def number_of_threads():
-    """The threads of this process, those of libraries too, on Linux."""
-    return len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
-
-
-THREADS_OF_IMPORTS = number_of_threads()
+THREADS_OF_IMPORTS = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
 
 
 def start_method():
@@ -373,8 +356,8 @@ def start_method():
     """
     if START_METHOD or sys.platform != "linux":
         return START_METHOD or "spawn"
-    clean = number_of_threads() <= THREADS_OF_IMPORTS and "jax" not in sys.modules
-    return "fork" if clean else "forkserver"
+    threads = len(os.listdir("/proc/self/task"))
+    return "forkserver" if threads > THREADS_OF_IMPORTS or "jax" in sys.modules else "fork"
 
 
 @contextlib.contextmanager
@@ -411,21 +394,15 @@ def prepare_worker():
 
 
 @functools.cache
-def worker_environment(task):
+def worker_environment(task, render_mode):
     """The environment of this worker, of a pickled task. It is made once: a simulator may take long to start."""
-    return gym.make(pickle.loads(task))
+    return gym.make(pickle.loads(task), render_mode=render_mode)
 
 
-def play_in_worker(file, seed):
-    """One episode in a worker: return and length. The file holds `evaluate`, the pickled task and the policy."""
-    evaluate, task, policy = pickle.loads(file.read_bytes())
-    return evaluate(policy, worker_environment(task), seed)
-
-
-def film_in_worker(file, *arguments):
-    """A film made in a worker. The file holds the clips and the pickled task."""
-    clips, task = pickle.loads(file.read_bytes())
-    film(clips, pickle.loads(task), *arguments)
+def call_in_worker(file, render_mode, *arguments):
+    """What `function(value, environment, *arguments)` returns. The file holds function, value and the pickled task."""
+    function, value, task = pickle.loads(file.read_bytes())
+    return function(value, worker_environment(task, render_mode), *arguments)
 
 
 # Evaluation, films, the curve
@@ -461,9 +438,10 @@ def evaluate_file(path, script, config, policy, task, evaluate):
         _, text = summarize([evaluate(policy, env, seed) for seed in tqdm(seeds, disable=None)])
     say(f"{path}: {text}")
     if config.video:
-        with or_warn("film"):
-            film([(policy, None)], task, seeds[0], path.with_suffix(".mp4"))
-            say(f"filmed one episode: {path.with_suffix('.mp4')}")
+        video = path.with_suffix(".mp4")
+        with or_warn("film"), gym.make(task, render_mode="rgb_array") as env:
+            film([(policy, None, None)], env, seeds[0], video)
+            say(f"filmed one episode: {video}")
 
 
 @contextlib.contextmanager
@@ -475,25 +453,26 @@ def or_warn(what):
         say(f"warning: no {what} ({first_line(error)})")
 
 
-def film(clips, task, seed, path, seconds=math.inf):
+def film(clips, env, seed, path, seconds=math.inf):
     """Films the first `seconds` of an episode for each of `clips`, in real time, at most 50 frames a second.
 
-    A clip is a policy (None: random actions) and a caption or None.
+    A clip is a policy (None: random actions), weights to load into it or None, and a caption or None.
     """
     import imageio  # here: it takes a moment
 
-    with gym.make(task, render_mode="rgb_array") as env:
-        rate = env.metadata.get("render_fps") or 30
-        skip = math.ceil(rate / 50)
-        options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    rate = env.metadata.get("render_fps") or 30
+    skip = math.ceil(rate / 50)
+    options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
 
-        def write(file):
-            with imageio.get_writer(file.name, **options) as video:
-                for policy, caption in clips:
-                    for frame in frames(env, policy, seed, skip, seconds * rate):
-                        video.append_data(with_caption(frame, caption))
+    def write(file):
+        with imageio.get_writer(file.name, **options) as video:
+            for policy, weights, caption in clips:
+                if weights is not None:
+                    policy.load_state_dict(weights)
+                for frame in frames(env, policy, seed, skip, seconds * rate):
+                    video.append_data(with_caption(frame, caption))
 
-        write_atomically(path, write)
+    write_atomically(path, write)
 
 
 def frames(env, policy, seed, skip, max_steps):
@@ -675,8 +654,8 @@ class Run:
         if self.rank == 0:
             self._begin_files()
             limit = self.task.max_episode_steps
-            say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps")
-            say(f"{self.world_size} process(es), device {self.device}, run directory {self.path}")
+            say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps, on {self.device}")
+            say(f"run directory {self.path}")
         if not checkpoint or checkpoint["config"] != self.plain_config:
             self.save(step)  # from here on --resume continues the run with these settings
         self.evaluate(0, policy=None)
@@ -738,12 +717,22 @@ class Run:
         state = {name: getattr(self, name) for name in self.SAVED}
         state |= {"step": step, "seconds": time.perf_counter() - self.started, "processes": processes}
         state |= {"agent": self.agent.state_dict(), "optimizers": [each.state_dict() for each in self.agent.optimizers]}
-        self._write("policy.pt", "policy", {"weights": cpu_copy(self.agent.policy).state_dict()})
+        self._write("policy.pt", "policy", {"weights": self._cpu_policy().state_dict()})
         self._write("checkpoint.pt", "checkpoint", state)
 
     def _write(self, name, kind, state):
         head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": self.plain_config}
         write_atomically(self.path / name, lambda file: torch.save(head | state, file))
+
+    def _cpu_policy(self):
+        return copy.deepcopy(self.agent.policy).cpu().eval()
+
+    def _submit(self, name, function, value, render_mode, *arguments):
+        """The future of `function(value, environment, *arguments)` in a worker. `value` is pickled to a file, once."""
+        file = self.scratch / name
+        if not file.exists():
+            file.write_bytes(pickle.dumps((function, value, cloudpickle.dumps(self.task))))
+        return self.pool.submit(call_in_worker, file, render_mode, *arguments)
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
@@ -783,10 +772,9 @@ class Run:
         table = "eval" if policy else "random"
         if self.rank or any(row["step"] == step for row in self.tables[table][-1:]):
             return
-        policy = policy and cpu_copy(policy)
-        file = self.scratch / "policy"
-        file.write_bytes(pickle.dumps((self.evaluate_episode, cloudpickle.dumps(self.task), policy)))
-        episodes = [self.pool.submit(play_in_worker, file, seed) for seed in evaluation_seeds(self.config)]
+        policy = policy and self._cpu_policy()
+        seeds = evaluation_seeds(self.config)
+        episodes = [self._submit(f"{table}{step}", self.evaluate_episode, policy, None, seed) for seed in seeds]
         if not self._wait(episodes):
             return
         row, text = summarize([episode.result() for episode in episodes])
@@ -845,13 +833,13 @@ class Run:
             return
         self.progress.close()
         self._plot()
-        policy = cpu_copy(self.agent.policy)
-        best = with_weights(policy, self.best[1])
-        for name, each in (("policy.pt2", policy), ("best_policy.pt2", best)):
-            with or_warn(name):
-                export_policy(self.path / name, each, observation_shape)
+        policy = self._cpu_policy()
         if self.config.video:
             self._film(policy)
+        with or_warn("exported policies"):
+            export_policy(self.path / "policy.pt2", policy, observation_shape)
+            policy.load_state_dict(self.best[1])
+            export_policy(self.path / "best_policy.pt2", policy, observation_shape)
         files = sorted(path.name for path in self.path.iterdir())
         say(f"finished; {self.path} holds {', '.join(files)}")
 
@@ -861,16 +849,14 @@ class Run:
 
     def _film(self, policy):
         say("filming the trained agent, a random one, and how it learned ...")
-        learning = [(with_weights(policy, weights), caption) for caption, weights in self.snapshots]
-        films = {"learning": learning, "trained_agent": [(policy, None)], "random_agent": [(None, None)]}
+        learning = [(policy, weights, caption) for caption, weights in self.snapshots]
+        films = {"learning": learning, "trained_agent": [(policy, None, None)], "random_agent": [(None, None, None)]}
         seed = evaluation_seeds(self.config)[0]
         tasks = {}
         for name, clips in films.items():
-            file = self.scratch / name
-            file.write_bytes(pickle.dumps((clips, cloudpickle.dumps(self.task))))
-            seconds = 4 if name == "learning" else math.inf
             path = self.path.absolute() / f"{name}.mp4"
-            tasks[name] = self.pool.submit(film_in_worker, file, seed, path, seconds)
+            seconds = 4 if name == "learning" else math.inf
+            tasks[name] = self._submit(name, film, clips, "rgb_array", seed, path, seconds)
         for name, task in tasks.items():
             with or_warn(f"{name}.mp4"):
                 if not self._wait([task]):

@@ -307,13 +307,14 @@ def test_sac_learns_pendulum(tmp_path):
 
 def film(path, clips, register, **kwargs):
     register(limit=50, **kwargs)
-    common.film(clips, gym.spec("Mine-v0"), 0, path)
+    with gym.make("Mine-v0", render_mode="rgb_array") as env:
+        common.film(clips, env, 0, path)
     with imageio.get_reader(path) as video:
         return video.get_meta_data(), [np.asarray(frame) for frame in video]
 
 
 def test_films_in_real_time_with_a_caption_for_each_policy(register, tmp_path):
-    data, frames = film(tmp_path / "film.mp4", [(None, None), (None, "a caption")], register)
+    data, frames = film(tmp_path / "film.mp4", [(None, None, None), (None, None, "a caption")], register)
     assert data["fps"] == 50 and len(frames) == 2 * 26  # every second of 50 steps, and the last
     assert frames[0].shape == (32, 48, 3) and np.abs(frames[12].mean() - 240) < 12 and frames[0].std() < 3
     assert frames[26].std() > 10  # letters
