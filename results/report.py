@@ -1,7 +1,6 @@
 """Prints README's tables and draws its figures from the CSVs beside this file: `python results/report.py`.
 
-`results/<experiment>/seed<k>/` holds the CSVs of one run, `results/earlier_defaults/` experiments with an earlier
-default. `tutorials.csv` holds what the TF-Agents tutorials print.
+`results/<experiment>/seed<k>/` holds the CSVs of one run. `tutorials.csv` holds what the TF-Agents tutorials print.
 """
 
 import csv
@@ -81,21 +80,6 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
-def print_sac_ablation(base, without, steps):
-    """Median returns of `base` and of the runs without one choice after these updates, with the seeds of all."""
-    names = [path.relative_to(RESULTS).as_posix() for path in RESULTS.glob(f"{without}*")]
-    curves = {"nothing": runs(base)} | {name.removeprefix(without): runs(name) for name in names}
-    seeds = sorted(set.intersection(*map(set, curves.values())))
-    print(f"\n### {base}, without one choice, medians of seeds {', '.join(map(str, seeds))}\n")
-    print(f"| without | {' | '.join(map(str, steps))} |\n|{' --- |' * (len(steps) + 1)}")
-    rows = {}
-    for label, evaluations in curves.items():
-        at = [returns_by_step(evaluations[seed]) for seed in seeds]
-        rows[label] = [median(returns[step] for returns in at) for step in steps]
-    for label, medians in sorted(rows.items(), key=lambda row: -row[1][-1]):
-        print(f"| {label} | {' | '.join(number(value, 1) for value in medians)} |")
-
-
 def print_dqn_ablation(base):
     """How many seeds of `base` and of the runs without a choice reach 200 early, and stay there from 10 000 on."""
     columns = "without | seeds | 200 by 5000 | median first 200 | stay ≥ 195 | worst"
@@ -143,9 +127,6 @@ def main():
             print_table(name, goal=3_000, late=50_000)
         elif "sac" in name:
             print_table(name, goal=15, late=50_000)
-    print_sac_ablation("sac_minitaur", "sac_20000_without_", (10_000, 20_000))
-    earlier = "earlier_defaults/sac_minitaur", "earlier_defaults/sac_50000_without_"
-    print_sac_ablation(*earlier, (10_000, 20_000, 30_000, 50_000))
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
