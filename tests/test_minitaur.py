@@ -334,7 +334,7 @@ keep.itself = keep
 
 
 def test_other_tasks_need_no_pybullet(tmp_path):
-    code = f"""
+    code = """
 import os, sys
 sys.modules.update(dict.fromkeys(("pybullet", "pybullet_data", "pybullet_utils")))  # an import of these raises
 import gymnasium as gym
