@@ -375,7 +375,7 @@ def worker_pool(size):
     finally:
         for process in set(multiprocessing.active_children()) - others:
             process.kill()
-        pool.shutdown(wait=False, cancel_futures=True)
+        pool.shutdown(cancel_futures=True)
 
 
 def prepare_worker():
