@@ -39,7 +39,6 @@ from tqdm import tqdm
 
 FILE_FORMAT = 4  # of checkpoints and policies
 MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video")
-START_METHOD = None  # of worker processes: fork, forkserver or spawn; None: see `start_method`
 
 # The types of the scripts' options
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
@@ -59,7 +58,8 @@ class InputError(Exception):
 def run_main(main):
     """Calls `main` as a script does: an InputError becomes one line and exit status 2, Ctrl-C exit status 130."""
     for stream in (sys.stdout, sys.stderr):
-        stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+        if hasattr(stream, "reconfigure"):  # a notebook's have not
+            stream.reconfigure(errors="replace")  # a console without an α shows a question mark
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
     try:
@@ -197,7 +197,7 @@ def export_policy(path, policy, observation_shape):
 # Tasks, seeds, devices
 
 
-def find_task(config, action_space):
+def find_task(config, action_space, training=True):
     """The gymnasium spec of --env-id, with a time limit, and its observation and action spaces.
 
     Raises InputError when the task is unknown, or has not the kind of `action_space` that the algorithm needs,
@@ -222,7 +222,7 @@ def find_task(config, action_space):
         task.max_episode_steps = config.max_episode_steps or env.spec.max_episode_steps
     if task.max_episode_steps is None:
         task.max_episode_steps = 10_000  # an evaluation has to end
-    elif task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
+    elif training and task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
         what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {task.max_episode_steps} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
     return task, env.observation_space, env.action_space
@@ -354,17 +354,18 @@ def start_method():
 
     A fork lacks the threads. A task on JAX, CUDA or several threads of PyTorch would wait for them for ever.
     """
-    if START_METHOD or sys.platform != "linux":
-        return START_METHOD or "spawn"
-    threads = len(os.listdir("/proc/self/task"))
-    return "forkserver" if threads > THREADS_OF_IMPORTS or "jax" in sys.modules else "fork"
+    if sys.platform != "linux":
+        return "spawn"
+    if len(os.listdir("/proc/self/task")) <= THREADS_OF_IMPORTS and "jax" not in sys.modules:
+        return "fork"
+    multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once for all workers
+    return "forkserver"
 
 
 @contextlib.contextmanager
 def worker_pool(size):
     """A pool of `size` processes. They, and all others that start until its end, are killed at its end."""
     others = set(multiprocessing.active_children())
-    multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once for all workers
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(start_method()), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a new process inherits
     for _ in range(size):
@@ -644,6 +645,7 @@ class Run:
     def begin(self, task, agent, buffer, checkpoint):
         """Restores the checkpoint, begins the files, evaluates random actions. Returns the number of updates done."""
         self.task = task
+        self.pickled_task = cloudpickle.dumps(task)  # once: by these bytes a worker knows the environment it has made
         self.agent = agent
         self.buffer = buffer
         step = self._restore(checkpoint) if checkpoint else 0
@@ -727,12 +729,11 @@ class Run:
     def _cpu_policy(self):
         return copy.deepcopy(self.agent.policy).cpu().eval()
 
-    def _submit(self, name, function, value, render_mode, *arguments):
-        """The future of `function(value, environment, *arguments)` in a worker. `value` is pickled to a file, once."""
+    def _pickled(self, name, function, value):
+        """A file from which workers take `function(value, environment, …)`, so that `value` is pickled once for all."""
         file = self.scratch / name
-        if not file.exists():
-            file.write_bytes(pickle.dumps((function, value, cloudpickle.dumps(self.task))))
-        return self.pool.submit(call_in_worker, file, render_mode, *arguments)
+        file.write_bytes(pickle.dumps((function, value, self.pickled_task)))
+        return file
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
@@ -773,8 +774,8 @@ class Run:
         if self.rank or any(row["step"] == step for row in self.tables[table][-1:]):
             return
         policy = policy and self._cpu_policy()
-        seeds = evaluation_seeds(self.config)
-        episodes = [self._submit(f"{table}{step}", self.evaluate_episode, policy, None, seed) for seed in seeds]
+        file = self._pickled("policy", self.evaluate_episode, policy)
+        episodes = [self.pool.submit(call_in_worker, file, None, seed) for seed in evaluation_seeds(self.config)]
         if not self._wait(episodes):
             return
         row, text = summarize([episode.result() for episode in episodes])
@@ -856,7 +857,8 @@ class Run:
         for name, clips in films.items():
             path = self.path.absolute() / f"{name}.mp4"
             seconds = 4 if name == "learning" else math.inf
-            tasks[name] = self._submit(name, film, clips, "rgb_array", seed, path, seconds)
+            file = self._pickled(name, film, clips)
+            tasks[name] = self.pool.submit(call_in_worker, file, "rgb_array", seed, path, seconds)
         for name, task in tasks.items():
             with or_warn(f"{name}.mp4"):
                 if not self._wait([task]):

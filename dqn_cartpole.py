@@ -363,7 +363,7 @@ def main():
     if policy_file is None:
         train(config, resume)
         return
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
+    task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete, training=False)
     policy = Policy(config, observation_space, action_space)
     common.evaluate_file(policy_file, "dqn_cartpole", config, policy, task, evaluate)
 

@@ -61,6 +61,7 @@ class Config:
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
     gamma: common.Fraction = 0.99  # discount
     time_limit_terminates: bool = False  # ours (theirs: yes): a time limit counts as an end of the task
+    observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): policy ← policy + τ (actor − policy)
@@ -95,6 +96,7 @@ TUTORIAL = {
     "privileged_critics": False,
     "critic_batch_norm": False,
     "time_limit_terminates": True,
+    "observation_scaling": False,
     "reward_scaling": False,
     "reward_scale_factor": 1.0,
     "averaged_actor_tau": 1.0,
@@ -166,7 +168,7 @@ class Policy(nn.Module):
     def __init__(self, config, observation_space, action_space):
         super().__init__()
         self.action_space = action_space
-        self.scaling = common.ObservationScaling(observation_space)
+        self.scaling = common.ObservationScaling(observation_space) if config.observation_scaling else nn.Identity()
         self.actor = Actor(math.prod(observation_space.shape), math.prod(action_space.shape), config.actor_layers)
         low = np.float32(action_space.low)
         high = np.float32(action_space.high)
@@ -274,7 +276,7 @@ class SACAgent(nn.Module):
         self.action_shape = action_space.shape
         action_size = math.prod(action_space.shape)
         self.target_entropy = config.target_entropy_per_action * action_size
-        self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_reward_scale
+        self.register_buffer("reward_scale", torch.tensor(config.reward_scale_factor))  # see fit_scaling
         self.policy = Policy(config, observation_space, action_space).requires_grad_(False)
         self.scaling = self.policy.scaling
         self.actor = copy.deepcopy(self.policy.actor).requires_grad_(True)  # learns; policy.actor follows it
@@ -298,7 +300,8 @@ class SACAgent(nn.Module):
 
         Rewards are divided by their standard deviation.
         """
-        self.scaling.fit(observations[:, : self.actor.observation_size])
+        if self.config.observation_scaling:
+            self.scaling.fit(observations[:, : self.actor.observation_size])
         if self.config.reward_scaling:
             mean = rewards.mean()
             common.average([mean])  # in place, over the processes
@@ -769,7 +772,7 @@ def main():
     if policy_file is None:
         train(config, resume)
         return
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
+    task, observation_space, action_space = common.find_task(config, gym.spaces.Box, training=False)
     policy = Policy(config, observation_space, action_space)
     common.evaluate_file(policy_file, "sac_minitaur", config, policy, task, evaluate)
 

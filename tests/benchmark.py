@@ -26,7 +26,6 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-import common  # noqa: E402
 import sac_minitaur  # noqa: E402
 
 REPEATS = 3
@@ -70,17 +69,18 @@ def environment_candidates():
 def update_candidates():
     config, cpu = sac_minitaur.Config(), torch.device("cpu")
     buffer = sac_minitaur.ReplayBuffer(100_000, 35, 8, cpu)
-    buffer.rows.normal_()
-    buffer.rows[:, 35 + 8 + 1] = 0  # nothing terminates
+    for tensor in (buffer.observations, buffer.actions, buffer.rewards, buffer.next_observations):
+        tensor.normal_()
+    buffer.terminated.zero_()
     buffer.size = 100_000
 
     def new_agent(config):
         spaces = gym.spaces.Box(-1, 1, (28,), np.float32), gym.spaces.Box(-1, 1, (8,), np.float32)
-        return sac_minitaur.SACAgent(config, *spaces, 35, cpu, common.Ranks())
+        return sac_minitaur.SACAgent(config, *spaces, 35, cpu)
 
     def update(agent, num_threads):
         torch.set_num_threads(num_threads)
-        return milliseconds(lambda: agent.update(buffer.sample(256)), 100)
+        return milliseconds(lambda: agent.update(buffer.sample(256), 0), 100)  # 0: of actor and α, too
 
     normalized, plain = new_agent(config), new_agent(sac_minitaur.Config(critic_batch_norm=False))
     yield "1 thread", lambda: update(normalized, 1)
@@ -104,6 +104,7 @@ def training(evaluations, *flags):
         run(
             "sac_minitaur.py", "--env-id", f"benchmark:{UPRIGHT}", "--num-iterations", 2 * TRAINING_STEPS,
             "--initial-collect-steps", 500, "--log-interval", TRAINING_STEPS, "--no-video",
+            "--num-envs", 1, "--batch-size", 256, "--actor-update-interval", 1,  # as the peers
             "--eval-interval", 1_000 if evaluations else 1_000_000, "--num-eval-episodes", 2 if evaluations else 1,
             "--run-dir", Path(directory) / "run", *flags,
         )  # fmt: skip
@@ -190,7 +191,6 @@ def dqn_candidates():
 
 
 def main():
-    common.keep_freed_memory()
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch"
     print(machine, torch.__version__, file=sys.stderr)
     table = csv.writer(sys.stdout, lineterminator="\n")

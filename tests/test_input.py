@@ -28,7 +28,7 @@ TUTORIALS = {
         "privileged_critics": False, "critic_batch_norm": False, "reward_scaling": False, "reward_scale_factor": 1,
         "averaged_actor_tau": 1, "target_entropy_per_action": -0.5, "replay_buffer_capacity": 10_000,
         "time_limit_terminates": True, "num_iterations": 100_000, "num_envs": 1, "batch_size": 256,
-        "actor_update_interval": 1,
+        "actor_update_interval": 1, "observation_scaling": False,
     },
     "dqn_cartpole": {
         "learning_rate_decay": None, "gamma": 1, "target_update_tau": 1, "value_unit": False, "advantage_learning": 0,
@@ -40,8 +40,6 @@ TUTORIALS = {
 def main(monkeypatch, *arguments, script="sac_minitaur"):
     """The command line within this process. Returns the exit status."""
     monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, arguments)])
-    monkeypatch.setattr(sys.stdout, "reconfigure", lambda **_: None, raising=False)  # pytest's have none
-    monkeypatch.setattr(sys.stderr, "reconfigure", lambda **_: None, raising=False)
     try:
         common.run_main(MODULES[script].main)
     except SystemExit as exit_:
@@ -147,6 +145,18 @@ def test_bad_input_is_one_line_and_status_2(arguments, said, monkeypatch, capfd,
     assert re.search(said, output.err), output.err
     assert (tmp_path / "full" / "file").read_text() == "somebody's work"
     assert not list(tmp_path.glob("run*"))  # the corrected command may name the same directory
+
+
+def test_a_notebooks_streams_have_no_reconfigure(monkeypatch):
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, io.StringIO())
+    with pytest.raises(SystemExit, match="2"):
+        common.run_main(refuse)
+    assert sys.stderr.getvalue() == "error: what is wrong\n"
+
+
+def refuse():
+    raise common.InputError("what is wrong")
 
 
 class Spaces(gym.Env):
@@ -278,7 +288,7 @@ def test_a_policy_is_evaluated_as_the_run_was(script, reference, tmp_path):
         )
     other_task = ["--evaluate", reference / "policy.pt", "--no-video", "--env-id"]
     other_task.append("MountainCar-v0" if script == "dqn_cartpole" else "MountainCarContinuous-v0")
-    run = Process(script, [*other_task, "--checkpoint-interval", 1000], tmp_path / "other")
+    run = Process(script, other_task, tmp_path / "other")
     assert run.wait() == 2 and "policy.pt does not fit MountainCar" in run.stderr and run.stderr.count("\n") == 1
     more = ["--num-eval-episodes", 1, "--seed", 9]
     run = finish(script, ["--evaluate", reference / "best_policy.pt", "--no-video", *more], tmp_path / "one")

@@ -316,7 +316,7 @@ def test_where_processes_are_spawned(reference, script, tmp_path):
 
 
 def spawn(module):
-    common.START_METHOD = "spawn"
+    common.start_method = lambda: "spawn"
 
 
 def test_minitaur_resumes_exactly(tmp_path):
