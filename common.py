@@ -18,7 +18,6 @@ import os
 import pickle
 import signal
 import sys
-import tempfile
 import threading
 import time
 import zipfile
@@ -33,7 +32,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 import tyro
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 from pydantic_core import to_json, to_jsonable_python
 from tqdm import tqdm
 
@@ -82,10 +81,9 @@ def say(line):
     sys.stdout.flush()
 
 
-def first_line(error):
-    """The first line of an exception's message, or its type where it has none."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:200]
+def one_line(error):
+    """An exception's message in one line, or its type where it has none."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 # The command line
@@ -94,8 +92,8 @@ def first_line(error):
 def read_command_line(script, config_class, tutorial, description):
     """The config, --resume's directory or None, and --evaluate's file or None. Raises InputError.
 
-    It is read twice. The first reading tells where the values come from that have no flag: a saved run, a saved policy,
-    or `tutorial`, a dict.
+    It is read twice. The first reading looks for --tutorial, --resume and --evaluate alone. They choose the defaults of
+    all other flags: `tutorial`, a dict, or a saved run's or policy's config.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--tutorial", action=argparse.BooleanOptionalAction)
@@ -163,28 +161,19 @@ def write_atomically(path, write):
 def read_file(path, kind, script, config_class):
     """What `Run` saved in a "checkpoint" or "policy" of this script, on the CPU, and its config.
 
-    Nothing in the file is executed. Raises InputError when it is missing, damaged or foreign.
+    Nothing in the file is executed. Raises InputError when it is missing, torn or foreign.
     """
-    hint = "--resume takes a run's directory, --evaluate its policy.pt"
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()  # torch.load does not look at the checksums
-        if damaged:
-            raise ValueError(f"{damaged} is damaged")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        found = f"a {state['kind']} of {state['script']}, format {state['format']}"
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist: {hint}") from None
-    except Exception as error:  # whatever a damaged or hostile file provokes
-        raise InputError(f"{path} is not a whole {kind} of this project ({first_line(error)}): {hint}") from None
     needed = f"a {kind} of {script}, format {FILE_FORMAT}"
-    if found != needed:
-        raise InputError(f"{path} is {found}; needed: {needed}")
     try:
+        with zipfile.ZipFile(path):  # torch.load would also try the formats from before 2020
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        found = f"a {state['kind']} of {state['script']}, format {state['format']}"
+        if found != needed:
+            raise ValueError(f"it is {found}")
         return state, config_class(**state["config"])
-    except ValidationError as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{path} has a config that this version of the script cannot use: {what}") from None
+    except Exception as error:  # whatever a torn or hostile file provokes
+        hint = "--resume takes a run's directory, --evaluate its policy.pt"
+        raise InputError(f"{path} cannot be used as {needed} ({one_line(error)}): {hint}") from None
 
 
 def export_policy(path, policy, observation_shape):
@@ -197,29 +186,33 @@ def export_policy(path, policy, observation_shape):
 # Tasks, seeds, devices
 
 
+def draw_without_display():
+    """Lets pygame and MuJoCo draw into memory. It must come before they are imported."""
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    if sys.platform == "linux" and "DISPLAY" not in os.environ:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
 def find_task(config, action_space, training=True):
     """The gymnasium spec of --env-id, with a time limit, and its observation and action spaces.
 
     Raises InputError when the task is unknown, or has not the kind of `action_space` that the algorithm needs,
     `gym.spaces.Discrete` or `Box`. An error of the task's own code is raised as it is.
     """
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws into memory and needs no display
-    if sys.platform == "linux" and "DISPLAY" not in os.environ:
-        os.environ.setdefault("MUJOCO_GL", "egl")  # nor does MuJoCo, if it is told so before it is imported
+    draw_without_display()
     name = f"--env-id {config.env_id}"
     try:
         env = gym.make(config.env_id, max_episode_steps=config.max_episode_steps)
     except (gym.error.Error, ImportError) as error:
-        unknown = isinstance(error, gym.error.UnregisteredEnv)
-        hint = " (a package's task is written package:Task-v0, as highway_env:highway-v0)" if unknown else ""
-        raise InputError(f"{name} cannot be made: {first_line(error)}{hint}") from None
+        hint = "a package's task is written package:Task-v0, as highway_env:highway-v0"
+        raise InputError(f"{name} cannot be made: {one_line(error)} ({hint})") from None
     with env:
         require_spaces(name, env.observation_space, env.action_space, action_space)
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
                 say(f"warning: each evaluation's {wrapper} starts anew: it cannot know the statistics of training")
         task = copy.copy(gym.registry[env.unwrapped.spec.id])
-        task.max_episode_steps = config.max_episode_steps or env.spec.max_episode_steps
+        task.max_episode_steps = env.spec.max_episode_steps  # the flag's, if there is one
     if task.max_episode_steps is None:
         task.max_episode_steps = 10_000  # an evaluation has to end
     elif training and task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
@@ -230,19 +223,16 @@ def find_task(config, action_space, training=True):
 
 def require_spaces(name, observations, actions, action_space):
     """Raises InputError unless a task's spaces are a Box, and a Discrete from 0 for DQN or a Box of floats for SAC."""
-    if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape:
         hint = "gymnasium.wrappers.FlattenObservation makes one of most others"
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed ({hint})")
     fits = isinstance(actions, action_space)
     if fits and action_space is gym.spaces.Discrete:
         fits = actions.start == 0
     if fits and action_space is gym.spaces.Box:
-        fits = actions.dtype in (np.float16, np.float32, np.float64) and math.prod(actions.shape) * len(actions.shape)
-    if fits and action_space is gym.spaces.Box:
-        widths = torch.tensor(actions.high).float() - torch.tensor(actions.low).float()  # as the networks compute
-        fits = (widths.isfinite() & (widths > 0)).all()
+        fits = actions.shape and np.issubdtype(actions.dtype, np.floating) and actions.is_bounded()
     if not fits:
-        needed = "dqn_cartpole.py needs a Discrete from 0, sac_minitaur.py a Box of floats with bounds, low < high"
+        needed = "dqn_cartpole.py needs a Discrete from 0, sac_minitaur.py a Box of floats with bounds"
         hint = "gymnasium.wrappers.TransformAction can map others"
         raise InputError(f"{name} has the action space {actions}: {needed} ({hint})")
 
@@ -309,17 +299,8 @@ def select_device(name, local_rank=0):
     try:
         torch.empty(1, device=device)
     except (AssertionError, RuntimeError) as error:
-        raise InputError(f"--device {device} cannot be used ({first_line(error)}): use --device cpu") from None
+        raise InputError(f"--device {device} cannot be used ({one_line(error)}): use --device cpu") from None
     return device
-
-
-def empty_replay(shape, device):
-    """An uninitialized float32 tensor. Raises InputError when that memory is refused."""
-    try:
-        return torch.empty(shape, device=device)
-    except (RuntimeError, TypeError):  # the latter for a number beyond 64 bits
-        size = f"{math.prod(shape) * 4 / 1e9:.1f} GB"
-        raise InputError(f"--replay-buffer-capacity {shape[0]} takes {size}, more than is free: use less") from None
 
 
 # Processes
@@ -346,27 +327,24 @@ def average(tensors):
         tensor.copy_(total.view_as(tensor) / dist.get_world_size())
 
 
-THREADS_OF_IMPORTS = len(os.listdir("/proc/self/task")) if sys.platform == "linux" else 0
+def start_method(env_id):
+    """How to start workers: "fork" is the quickest, but copies no threads and no CUDA of the main process.
 
-
-def start_method():
-    """How to start workers: "fork", the quickest, while nothing has started threads in this process.
-
-    A fork lacks the threads. A task on JAX, CUDA or several threads of PyTorch would wait for them for ever.
+    A package's task (package:Task-v0) and any task on JAX may wait for these for ever. So their workers start clean.
     """
     if sys.platform != "linux":
         return "spawn"
-    if len(os.listdir("/proc/self/task")) <= THREADS_OF_IMPORTS and "jax" not in sys.modules:
+    if ":" not in env_id and "jax" not in sys.modules:
         return "fork"
     multiprocessing.set_forkserver_preload(["torch", "gymnasium", "tyro", "pydantic"])  # imported once for all workers
     return "forkserver"
 
 
 @contextlib.contextmanager
-def worker_pool(size):
-    """A pool of `size` processes. They, and all others that start until its end, are killed at its end."""
+def worker_pool(size, method):
+    """A pool of `size` processes. They, and the environments' processes of a run that fails, are killed at its end."""
     others = set(multiprocessing.active_children())
-    pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(start_method()), prepare_worker)
+    pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a new process inherits
     for _ in range(size):
         pool.submit(int)  # starts a process
@@ -383,6 +361,7 @@ def prepare_worker():
     """Prepares a worker process: Ctrl-C is the main process's, and it ends with that, even when that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    draw_without_display()
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: all workers begin with copies of the same
     torch.seed()
@@ -400,10 +379,9 @@ def worker_environment(task, render_mode):
     return gym.make(pickle.loads(task), render_mode=render_mode)
 
 
-def call_in_worker(file, render_mode, *arguments):
-    """What `function(value, environment, *arguments)` returns. The file holds function, value and the pickled task."""
-    function, value, task = pickle.loads(file.read_bytes())
-    return function(value, worker_environment(task, render_mode), *arguments)
+def call_in_worker(function, pickled, task, render_mode, *arguments):
+    """What `function(value, environment, *arguments)` returns, for a pickled value and a pickled task."""
+    return function(pickle.loads(pickled), worker_environment(task, render_mode), *arguments)
 
 
 # Evaluation, films, the curve
@@ -451,7 +429,7 @@ def or_warn(what):
     try:
         yield
     except Exception as error:
-        say(f"warning: no {what} ({first_line(error)})")
+        say(f"warning: no {what} ({one_line(error)})")
 
 
 def film(clips, env, seed, path, seconds=math.inf):
@@ -559,39 +537,13 @@ def stop_signals():
             signal.signal(number, handler)
 
 
-class Tables:
-    """Writes a run's tables, lists of rows (dicts): each is a CSV file, and each row is shown to TensorBoard."""
-
-    def __init__(self, directory, tables):
-        from torch.utils.tensorboard import SummaryWriter  # takes a second
-
-        self.directory = directory
-        self.tables = tables
-        self.writer = SummaryWriter(directory)
-        for name, rows in tables.items():
-            for row in rows:
-                self._show(name, row)
-            if rows:
-                self._write(name)
-
-    def add(self, name, row):
-        """Adds a row. A CSV keeps the columns of its first row; later ones go to TensorBoard alone."""
-        self.tables[name].append(row)
-        self._show(name, row)
-        self._write(name)
-
-    def _show(self, name, row):
-        for column, value in row.items():
-            if column != "step" and math.isfinite(value):
-                self.writer.add_scalar(f"{name}/{column}", value, row["step"])
-
-    def _write(self, name):
-        rows = self.tables[name]
-        text = io.StringIO()
-        writer = csv.DictWriter(text, rows[0], restval=math.nan, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_atomically(self.directory / f"{name}.csv", lambda file: file.write(text.getvalue().encode()))
+def write_csv(path, rows):
+    """Writes a table, a list of dicts. It has the columns of its first row: later ones go to TensorBoard alone."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], restval=math.nan, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
 
 
 class Run:
@@ -601,7 +553,7 @@ class Run:
     all environments and processes. Of torchrun's processes, number 0 alone evaluates, writes and prints.
     """
 
-    SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # what a checkpoint has of these fields
+    SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # by `save`, for `_restore`
 
     def __init__(self, script, config, evaluate, resume=None, processes=(0, 1, 0)):
         """Raises InputError for a config that cannot be used. Nothing is written yet."""
@@ -631,10 +583,8 @@ class Run:
     def __enter__(self):
         self.stop_request = self.stack.enter_context(stop_signals())
         if self.rank == 0:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-            size = min(cores, self.config.num_eval_episodes, 61)  # a pool's most on Windows
-            self.pool = self.stack.enter_context(worker_pool(size))
-            self.scratch = Path(self.stack.enter_context(tempfile.TemporaryDirectory()))
+            size = min(os.cpu_count(), self.config.num_eval_episodes)
+            self.pool = self.stack.enter_context(worker_pool(size, start_method(self.config.env_id)))
         self.stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(self.config.num_threads)
         return self
@@ -658,8 +608,8 @@ class Run:
             limit = self.task.max_episode_steps
             say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps, on {self.device}")
             say(f"run directory {self.path}")
-        if not checkpoint or checkpoint["config"] != self.plain_config:
-            self.save(step)  # from here on --resume continues the run with these settings
+        if not checkpoint:
+            self.save(step)  # from here on --resume continues the run
         self.evaluate(0, policy=None)
         return step
 
@@ -674,7 +624,7 @@ class Run:
             for name, rows in own["replay"].items():
                 getattr(self.buffer, name)[: len(rows)] = rows
         except (AttributeError, RuntimeError, ValueError) as error:
-            what = f"does not fit this script's networks, optimizers and replay ({first_line(error)})"
+            what = f"does not fit this script's networks, optimizers and replay ({one_line(error)})"
             raise InputError(f"{self.path} {what}: continue it with the script that saved it") from None
         self.buffer.size = own["size"]
         self.buffer.position = own["position"]
@@ -691,15 +641,21 @@ class Run:
             try:
                 self.path.mkdir(parents=True)
             except (OSError, ValueError) as error:
-                what = first_line(error)
-                raise InputError(f"--run-dir {self.path} cannot be made ({what}): name a new directory") from None
+                what = f"--run-dir {self.path} cannot be made ({one_line(error)})"
+                raise InputError(f"{what}: name a new directory") from None
         text = to_json(self.plain_config, indent=2) + b"\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
             path.unlink()  # of before: the tables are in the checkpoint, and a kill leaves temporary files
         if self.best[1] is not None:
             self._write("best_policy.pt", "policy", {"weights": self.best[1]})  # the file may be a later one's
-        self.table_files = Tables(self.path, self.tables)
+        from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
+
+        self.board = SummaryWriter(self.path)
+        self.stack.callback(self.board.close)
+        for table, rows in self.tables.items():
+            for row in rows:
+                self._show(table, row)
 
     def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises FloatingPointError for bad weights."""
@@ -729,12 +685,6 @@ class Run:
     def _cpu_policy(self):
         return copy.deepcopy(self.agent.policy).cpu().eval()
 
-    def _pickled(self, name, function, value):
-        """A file from which workers take `function(value, environment, …)`, so that `value` is pickled once for all."""
-        file = self.scratch / name
-        file.write_bytes(pickle.dumps((function, value, self.pickled_task)))
-        return file
-
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
         self.finished = [*self.finished, (float(episode_return), int(length))][-10:]
@@ -763,7 +713,16 @@ class Run:
 
     def _add_row(self, table, step, values):
         seconds = round(time.perf_counter() - self.started, 3)
-        self.table_files.add(table, {"step": step, "env_steps": self.env_steps, "seconds": seconds} | values)
+        row = {"step": step, "env_steps": self.env_steps, "seconds": seconds} | values
+        self.tables[table].append(row)
+        self._show(table, row)
+        write_csv(self.path / f"{table}.csv", self.tables[table])
+
+    def _show(self, table, row):
+        """Shows the row of a table to TensorBoard."""
+        for column, value in row.items():
+            if column != "step" and math.isfinite(value):
+                self.board.add_scalar(f"{table}/{column}", value, row["step"])
 
     def evaluate(self, step, policy):
         """Plays the evaluation episodes with `policy` (None: random actions) and logs them, once for each step.
@@ -771,11 +730,14 @@ class Run:
         The best policy so far is saved. A stop request ends this early: the run that continues does it again.
         """
         table = "eval" if policy else "random"
-        if self.rank or any(row["step"] == step for row in self.tables[table][-1:]):
+        rows = self.tables[table]
+        if self.rank or (rows and rows[-1]["step"] == step):
             return
-        policy = policy and self._cpu_policy()
-        file = self._pickled("policy", self.evaluate_episode, policy)
-        episodes = [self.pool.submit(call_in_worker, file, None, seed) for seed in evaluation_seeds(self.config)]
+        if policy:
+            policy = self._cpu_policy()
+        pickled = pickle.dumps(policy)  # once for all episodes
+        call = (call_in_worker, self.evaluate_episode, pickled, self.pickled_task, None)
+        episodes = [self.pool.submit(*call, seed) for seed in evaluation_seeds(self.config)]
         if not self._wait(episodes):
             return
         row, text = summarize([episode.result() for episode in episodes])
@@ -787,14 +749,12 @@ class Run:
             self._keep(step, row["average_return"], policy.state_dict())
 
     def _wait(self, tasks):
-        """Waits for tasks of the workers and raises what one of them raised. False: a stop was requested before."""
-        while tasks:
-            if self.stop_request.is_set():
-                return False
-            done, tasks = futures.wait(tasks, 0.1, futures.FIRST_EXCEPTION)
-            for task in done:
-                task.result()
-        return True
+        """Waits for tasks of the workers. Returns False if a stop was requested before their end."""
+        while not self.stop_request.is_set():
+            _, running = futures.wait(tasks, timeout=0.1)
+            if not running:
+                return True
+        return False
 
     def _keep(self, step, average_return, weights):
         """Keeps the best weights so far, and for a film those at 0, 1/16, 1/4, 9/16 and all of the updates."""
@@ -857,10 +817,11 @@ class Run:
         for name, clips in films.items():
             path = self.path.absolute() / f"{name}.mp4"
             seconds = 4 if name == "learning" else math.inf
-            file = self._pickled(name, film, clips)
-            tasks[name] = self.pool.submit(call_in_worker, file, "rgb_array", seed, path, seconds)
+            call = (call_in_worker, film, pickle.dumps(clips), self.pickled_task, "rgb_array")
+            tasks[name] = self.pool.submit(*call, seed, path, seconds)
         for name, task in tasks.items():
             with or_warn(f"{name}.mp4"):
                 if not self._wait([task]):
                     say(f"stopped while filming; to film: --resume '{self.path}'")
                     raise KeyboardInterrupt
+                task.result()

@@ -12,9 +12,9 @@ A reward one step later counts γ times as much. Each update moves Q(s, a) towar
     y = r + γ max Q̄(s', ·), or y = r where the task ended
 
 Here r is the reward, s' is the next state, and the maximum is over all actions there. Q̄ is the target network, a slow
-copy of the Q-network: so the target moves slowly. The policy takes the action of the largest Q. While it collects data,
-some actions are random: so it explores. A replay buffer keeps the transitions, and each update learns from a few of
-them, drawn at random.
+copy of the Q-network. Without it each update would move its own target, too, and Q could diverge. The policy takes the
+action of the largest Q. While it collects data, some actions are random: so it explores. A replay buffer keeps the
+transitions (s, a, r, s', ended). Each update learns from a few, drawn at random: neighbours in time are too similar.
 
 This script reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level
 control through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks what is "ours".
@@ -52,14 +52,14 @@ class Config:
     batch_size: PositiveInt = 64  # transitions for each update
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
-    learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): rate × 1 / (1 + (updates / this)²)
+    learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): after this many updates the rate is half
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε. Keras has this value, but adds it before the bias correction
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     time_limit_terminates: bool = False  # ours (theirs: yes, in 2023): a time limit counts as an end of the task
-    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1): target ← target + τ (Q-network − target)
-    value_unit: bool = True  # ours (theirs: no): Q = value of an endless episode + scale × output: `fit_scaling`
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q(s, ·) − Q(s, a))
+    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, a full copy): target ← target + τ (Q-network − target)
+    value_unit: bool = True  # ours (theirs: no): the network's output is Q, shifted and scaled: `fit_scaling`
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q̄(s, ·) − Q̄(s, a))
     observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
 
@@ -133,7 +133,7 @@ class Policy(nn.Module):
     def forward(self, observation):
         """Actions (batch,) for raw observations (batch, …)."""
         output = self.q_network(self.scaling(observation.flatten(1)))
-        return output.argmax(1)  # the largest output has the largest Q
+        return output.argmax(1)  # also of Q = offset + scale × output, because scale > 0
 
     @torch.inference_mode()
     def act(self, observation):
@@ -149,11 +149,11 @@ class ReplayBuffer:
     """
 
     def __init__(self, capacity, observation_size, device):
-        self.observations = common.empty_replay((capacity, observation_size), device)
-        self.actions = common.empty_replay((capacity,), device)
-        self.rewards = common.empty_replay((capacity,), device)
-        self.terminated = common.empty_replay((capacity,), device)
-        self.next_observations = common.empty_replay((capacity, observation_size), device)
+        self.observations = torch.empty((capacity, observation_size), device=device)
+        self.actions = torch.empty((capacity,), device=device)  # whole numbers
+        self.rewards = torch.empty((capacity,), device=device)
+        self.terminated = torch.empty((capacity,), device=device)
+        self.next_observations = torch.empty((capacity, observation_size), device=device)
         self.capacity = capacity
         self.size = 0
         self.position = 0
@@ -199,7 +199,7 @@ class DQNAgent(nn.Module):
         self.config = config
         self.device = device
         self.num_actions = int(action_space.n)
-        self.generator = torch.Generator()  # of actions and batches; a task may do as it likes with the global one
+        self.generator = torch.Generator()  # draws actions and batches. A task may use PyTorch's global generator
         self.generator.manual_seed(config.seed)
         self.policy = Policy(config, observation_space, action_space)
         self.scaling = self.policy.scaling
@@ -224,8 +224,8 @@ class DQNAgent(nn.Module):
     def fit_scaling(self, observations, rewards):
         """Fits the scales to observations (N, O) and rewards (N,) of random actions.
 
-        An output of 0 then means an endless episode, Q = mean reward / (1 − γ). The network learns what an end changes.
-        Where no reward was seen, Q is the output itself.
+        An output of 0 then means an episode that never ends: Q = mean reward / (1 − γ). CartPole's rewards are 1: with
+        γ = 0.99, Q = 100 + 100 × output, and an output of −1 means no more reward. Without rewards Q is the output.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations)
@@ -253,8 +253,8 @@ class DQNAgent(nn.Module):
     def update(self, batch, step):
         """Update number `step`, from 0. Returns the scalars to log, as tensors on the device.
 
-        Plain DQN: Q(s, a) takes a gradient step towards y = r + γ (1 − terminated) max Q̄(s', ·). Then the target
-        network Q̄ follows the Q-network: θ̄ ← θ̄ + τ (θ − θ̄). Each choice of ours is an `if` of its own.
+        Plain DQN: Q(s, a) takes a gradient step towards y = r + γ (1 − terminated) max Q̄(s', ·). Then the weights θ̄
+        of the target network follow the Q-network's: θ̄ ← θ̄ + τ (θ − θ̄). Each choice of ours is an `if` of its own.
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
@@ -265,7 +265,7 @@ class DQNAgent(nn.Module):
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # (B,)
-            if config.advantage_learning:  # ours: actions that are worse than the best fall further
+            if config.advantage_learning:  # ours: widens the gap to the best action, so errors change it less
                 target_q = self.q_values(self.target_network, s)  # Q̄(s, ·): (B, A)
                 y = y - config.advantage_learning * gap_to_best(target_q, a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
@@ -301,15 +301,15 @@ def evaluate(policy, env, seed):
 
 
 def collect_step(env, observation, action, buffer, run):
-    """Takes one step and stores the transition. Returns the observation to act on next: (O,)."""
+    """Takes one step, stores the transition, tells `run`. Returns the observation to act on next: (O,)."""
     next_observation, reward, terminated, truncated, info = env.step(action)
     if run.config.time_limit_terminates:  # theirs
         terminated = terminated or truncated
-    # At an episode's end this is its last observation, not the next episode's first one.
+    # The reset comes later: at an episode's end, too, next_observation is of this episode.
     buffer.add(observation, action, reward, terminated, next_observation)
     run.env_steps += 1
     if terminated or truncated:
-        run.log_episode(info["episode"]["r"], info["episode"]["l"])
+        run.log_episode(info["episode"]["r"], info["episode"]["l"])  # return, length: of RecordEpisodeStatistics
         next_observation, _ = env.reset()
     return next_observation
 
@@ -321,16 +321,16 @@ def train(config, resume=None):
     Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "dqn_cartpole")
-    with common.Run("dqn_cartpole", config, evaluate, resume) as run:
-        task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)
+    with common.Run("dqn_cartpole", config, evaluate, resume) as run:  # its evaluations call `evaluate`
+        task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # a gymnasium spec
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
         env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later
         torch.manual_seed(config.seed)
         agent = DQNAgent(config, observation_space, action_space, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, math.prod(observation_space.shape), run.device)
-        start = run.begin(task, agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
+        start = run.begin(task, agent, buffer, checkpoint)  # restores the checkpoint; the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:
+        if run.env_steps < config.initial_collect_steps:  # not in a run that continues after this phase
             observation, _ = env.reset(seed=common.derive_seed(config.seed))
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
@@ -338,8 +338,8 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode. So every checkpoint begins a new episode, killed or not. The
-            # episode that is cut has not ended: the transitions stored keep their bootstrap.
+            # gymnasium cannot save a task in mid-episode. So every checkpoint begins a new episode, also in a run that
+            # is not killed: a resumed run then repeats it. A cut episode is not terminated: its targets keep Q̄(s', ·).
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observation, _ = env.reset(seed=common.derive_seed(config.seed, update))

@@ -7,12 +7,15 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor π samples its actions; two critics estimate their value Q, later entropies included. The actor learns to
-make Q + α × entropy large: it earns much but stays random, and so it explores. The entropy is the mean of −log π(a|s).
-α is tuned until the entropy has a given value. The critics move to y = r + γ (min Q(s', a') − α log π(a'|s')), with
-a' ~ π(·|s'), and r, γ and s' as in dqn_cartpole.py. The minimum is over the two critics, not over actions. The actor
-uses it, too: an actor that maximizes one estimate exploits its errors. In the paper slow copies of the critics, the
-target critics, compute y. By default batch normalization replaces them.
+The actor π samples its actions. Two critics estimate Q(s, a): the later rewards, and α times the later entropies. The
+entropy is the mean of −log π(a|s). The actor learns to make Q + α × entropy large: it earns much but stays random, and
+so it explores. α is tuned until the entropy has a given value. The critics move to a target:
+
+    y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as in dqn_cartpole.py
+
+The minimum is over the two critics, not over actions. The actor uses it, too: an actor that maximizes one estimate
+exploits its errors. In the paper slow copies of the critics, the target critics, compute y. Ours compute it themselves,
+as in CrossQ: batch normalization makes their learning stable enough.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -45,11 +48,11 @@ class Config:
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
-    collect_steps_per_iteration: PositiveInt = 1  # steps of all environments for each update
+    collect_steps_per_iteration: PositiveInt = 1  # steps of each environment for each update
     num_envs: common.Count = 4  # ours (theirs: 1): environments stepped at once by each process, each in a worker
-    replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; in 2018 1e6): transitions kept by each process
+    replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
-    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): critics' updates for one of actor and α
+    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): updates of critics for each of actor, α
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
@@ -64,9 +67,9 @@ class Config:
     observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): policy ← policy + τ (actor − policy)
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): evaluated actor ← it + τ (trained actor − it)
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): the entropy to hold, for each dimension of an action
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): × dimensions of an action; uniform has +0.69
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -175,7 +178,7 @@ class Policy(nn.Module):
         # A float64 bound may lie between two float32 numbers: take the inner one.
         low = np.where(low < action_space.low, np.nextafter(low, high), low)
         high = np.where(high > action_space.high, np.nextafter(high, low), high)
-        self.register_buffer("low", torch.tensor(low))  # a copy: loading a policy writes to it
+        self.register_buffer("low", torch.tensor(low))
         self.register_buffer("high", torch.tensor(high))
 
     def forward(self, observation):
@@ -203,11 +206,11 @@ class ReplayBuffer:
     """
 
     def __init__(self, capacity, state_size, action_size, device):
-        self.observations = common.empty_replay((capacity, state_size), device)
-        self.actions = common.empty_replay((capacity, action_size), device)
-        self.rewards = common.empty_replay((capacity,), device)
-        self.terminated = common.empty_replay((capacity,), device)
-        self.next_observations = common.empty_replay((capacity, state_size), device)
+        self.observations = torch.empty((capacity, state_size), device=device)
+        self.actions = torch.empty((capacity, action_size), device=device)
+        self.rewards = torch.empty((capacity,), device=device)
+        self.terminated = torch.empty((capacity,), device=device)
+        self.next_observations = torch.empty((capacity, state_size), device=device)
         self.capacity = capacity
         self.size = 0
         self.position = 0
@@ -216,6 +219,7 @@ class ReplayBuffer:
         """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full one drops its oldest."""
         count = len(rewards)
         rows = (self.position + torch.arange(count)) % self.capacity
+        # .to(self.rewards): to the buffer's device, in float32
         self.observations[rows] = torch.from_numpy(observations).to(self.rewards)
         self.actions[rows] = torch.from_numpy(actions).to(self.rewards).flatten(1)
         self.rewards[rows] = torch.from_numpy(rewards).to(self.rewards)
@@ -255,9 +259,10 @@ def actor_loss(log_probs, q, alpha):
 
 
 def alpha_loss(log_alpha, log_probs, target_entropy):
-    """−log α × (log π + target entropy), averaged: raises α while the entropy is below its target. log_probs (B,).
+    """log α × (entropy − target entropy), where the entropy is the mean of −log π: log_probs (B,).
 
-    As in TF-Agents. Equation 18 of arXiv:1812.05905 has α where this has log α: the gradient's sign is the same.
+    A gradient step raises α while the entropy is too low. As in TF-Agents; equation 18 of arXiv:1812.05905 has α where
+    this has log α: the gradient's sign is the same.
     """
     return -(log_alpha * (log_probs.detach() + target_entropy)).mean()
 
@@ -327,7 +332,7 @@ class SACAgent(nn.Module):
         return actions.view(-1, *self.action_shape).cpu().numpy()
 
     def update(self, batch, step):
-        """Update number `step`, from 0: a gradient step of the critics, at every few also of the actor and α.
+        """Update number `step`, from 0: a gradient step of the critics, in some updates also of actor and α.
 
         `batch` is what `ReplayBuffer.sample` returns. Returns the scalars to log, as tensors on the device: `.item()`
         here would make the CPU wait for the GPU.
@@ -351,8 +356,9 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # Ours: one pass, as in CrossQ. The new a' are distributed differently from the stored a. So batch norm has
-            # one mean and variance over both. No gradient reaches next_q, because y is computed under no_grad.
+            # Ours: one pass, as in CrossQ. In two passes batch norm would scale the stored a and the new a' by other
+            # means and variances, and Q(s, a) and Q(s', a') would be two functions. No gradient reaches next_q, because
+            # y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
@@ -457,7 +463,7 @@ def make_training_env(task, privileged, main_process):
 
     With `privileged`, the environment's `privileged_observation` (S − O,), if it has one, follows the observation (O,).
     """
-    if os.getpid() != main_process:
+    if os.getpid() != main_process:  # AsyncVectorEnv makes one in the main process, too, to see its spaces
         common.prepare_worker()
     env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
     low = env.action_space.low
@@ -478,9 +484,9 @@ def make_training_env(task, privileged, main_process):
 def make_vector_env(task, config):
     """`num_envs` environments (K), each in a worker process. One whose episode has ended resets itself at once."""
     make = partial(make_training_env, task, config.privileged_critics, os.getpid())
-    return gym.vector.AsyncVectorEnv(
-        [make] * config.num_envs, context=common.start_method(), autoreset_mode=gym.vector.AutoresetMode.SAME_STEP
-    )
+    method = common.start_method(config.env_id)
+    autoreset = gym.vector.AutoresetMode.SAME_STEP
+    return gym.vector.AsyncVectorEnv([make] * config.num_envs, context=method, autoreset_mode=autoreset)
 
 
 def store(buffer, observations, actions, step, run):
@@ -489,7 +495,7 @@ def store(buffer, observations, actions, step, run):
     ended = terminated | truncated
     if run.config.time_limit_terminates:  # theirs
         terminated = ended
-    # Where an episode ended, next_observations has the next episode's first one. The transition has the last one.
+    # Where an episode ended, next_observations is already the next one's start. Its own end is in final_obs.
     last_observations = next_observations.copy()
     for i in np.flatnonzero(ended):
         last_observations[i] = infos["final_obs"][i]
@@ -509,10 +515,10 @@ def train(config, resume=None):
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
     processes = common.join_processes()  # of torchrun: rank, number of processes, rank on this machine
     rank, world_size, _ = processes
-    with common.Run("sac_minitaur", config, evaluate, resume, processes) as run:
+    with common.Run("sac_minitaur", config, evaluate, resume, processes) as run:  # its evaluations call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
-        run.stack.callback(envs.close, terminate=True)  # where the run fails
+        run.stack.callback(envs.close, terminate=True)  # is called at the run's end, after an error, too
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
@@ -522,9 +528,9 @@ def train(config, resume=None):
             agent.update_actor = cuda_graph(agent, agent.update_actor)
         torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process
         numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process's environments
-        start = run.begin(task, agent, buffer, checkpoint)  # the updates that are done: 0, or the checkpoint's
+        start = run.begin(task, agent, buffer, checkpoint)  # restores the checkpoint; the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:
+        if run.env_steps < config.initial_collect_steps:  # not in a run that continues after this phase
             observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in numbers])
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
@@ -533,8 +539,8 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode. So every checkpoint begins new episodes, killed or not. The
-            # episodes that are cut have not ended: the transitions stored keep their bootstrap.
+            # gymnasium cannot save a task in mid-episode. So every checkpoint begins new episodes, also in a run that
+            # is not killed: a resumed run then repeats it. A cut episode is not terminated: its targets keep Q(s', a').
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])
@@ -551,7 +557,7 @@ def train(config, resume=None):
             batch = buffer.sample(config.batch_size // world_size)  # this process's share of the batch
             metrics = agent.update(batch, update)
             observations = store(buffer, observations, actions, envs.step_wait(), run)
-            run.log(update + 1, metrics)  # a row every log_interval updates
+            run.log(update + 1, metrics)  # a row every log_interval updates, with the latest of each metric
 
         envs.close()
         run.finish(config.num_iterations, observation_space.shape)  # checkpoint, evaluation, curve, films

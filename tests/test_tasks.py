@@ -268,8 +268,9 @@ class Mine({kind}):
 gym.register("Mine-v0", entry_point=Mine)
 print({script}.train({script}.Config(**{choices})))
 """
-    command = [sys.executable, "-c", program]
+    (tmp_path / "program.py").write_text(program)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "program.py"]
     process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert process.returncode == 0 and process.stdout.splitlines()[-1] == "run", process.stderr
 
