@@ -1,22 +1,23 @@
-import sys
-from pathlib import Path
+import multiprocessing
 
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
 pytest.register_assert_rewrite("runs")
 
-from runs import SCRIPTS, finish, flags  # noqa: E402
+from runs import MODULES, Process, flags  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
-    """For `-n 2` on two cores. A test may set another number."""
+def one_thread_and_nothing_left():
+    """One thread is for `-n 2` on two cores: a test may set another number. A test that fails leaves no run behind."""
     torch.set_num_threads(1)
+    yield
+    for process in multiprocessing.active_children():
+        process.kill()
 
 
-@pytest.fixture(scope="session", params=SCRIPTS)
+@pytest.fixture(scope="session", params=MODULES)
 def script(request):
     return request.param
 
@@ -25,10 +26,6 @@ def script(request):
 def reference(script, tmp_path_factory):
     """A run that was left alone; its directory, which no test changes."""
     path = tmp_path_factory.mktemp(script)
-    finish(script, [*flags(script, path / "run"), *several(script)], path / "output")
+    run = Process(script, flags(script, path / "run"), path / "output")
+    assert run.wait() == 0, run.stderr
     return path / "run"
-
-
-def several(script):
-    """SAC's runs have three environments."""
-    return ["--num-envs", "3"] if script == "sac_minitaur" else []
