@@ -362,6 +362,8 @@ def prepare_worker():
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     draw_without_display()
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(5)  # the main process goes first: its update is the longest work between two vector steps
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: all workers begin with copies of the same
     torch.seed()
