@@ -288,14 +288,16 @@ def evaluation_seeds(config):
     return [derive_seed(config.seed, 2**32 - 1, i) for i in range(config.num_eval_episodes)]
 
 
-def select_device(name, local_rank=0):
-    """The `torch.device` for --device: `auto` is CUDA or else the CPU, `cuda` is GPU number `local_rank`.
+def select_device(name):
+    """The `torch.device` for --device: `auto` is CUDA or else the CPU. Each of torchrun's processes has its own GPU.
 
     Raises InputError for a device that is not there.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(f"cuda:{local_rank}" if name == "cuda" else name)
+    if name == "cuda":
+        name = "cuda:" + os.environ.get("LOCAL_RANK", "0")
+    device = torch.device(name)
     try:
         torch.empty(1, device=device)
     except (AssertionError, RuntimeError) as error:
@@ -307,12 +309,12 @@ def select_device(name, local_rank=0):
 
 
 def join_processes():
-    """This process's rank among those that torchrun started, their number, and its rank on its machine."""
+    """This process's rank among those that torchrun started, and their number."""
     if os.environ.get("WORLD_SIZE", "1") == "1":
-        return 0, 1, 0
+        return 0, 1
     if not dist.is_initialized():
         dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-    return dist.get_rank(), dist.get_world_size(), int(os.environ["LOCAL_RANK"])
+    return dist.get_rank(), dist.get_world_size()
 
 
 def average(tensors):
@@ -376,14 +378,14 @@ def prepare_worker():
 
 
 @functools.cache
-def worker_environment(task, render_mode):
+def worker_environment(task):
     """The environment of this worker, of a pickled task. It is made once: a simulator may take long to start."""
-    return gym.make(pickle.loads(task), render_mode=render_mode)
+    return gym.make(pickle.loads(task))
 
 
-def call_in_worker(function, pickled, task, render_mode, *arguments):
-    """What `function(value, environment, *arguments)` returns, for a pickled value and a pickled task."""
-    return function(pickle.loads(pickled), worker_environment(task, render_mode), *arguments)
+def evaluate_in_worker(evaluate, policy, task, seed):
+    """What `evaluate(policy, environment, seed)` returns, for a pickled policy and a pickled task."""
+    return evaluate(pickle.loads(policy), worker_environment(task), seed)
 
 
 # Evaluation, films, the curve
@@ -420,8 +422,8 @@ def evaluate_file(path, script, config, policy, task, evaluate):
     say(f"{path}: {text}")
     if config.video:
         video = path.with_suffix(".mp4")
-        with or_warn("film"), gym.make(task, render_mode="rgb_array") as env:
-            film([(policy, None, None)], env, seeds[0], video)
+        with or_warn("film"):
+            film(video, task, seeds[0], [(policy, None, None)])
             say(f"filmed one episode: {video}")
 
 
@@ -434,26 +436,27 @@ def or_warn(what):
         say(f"warning: no {what} ({one_line(error)})")
 
 
-def film(clips, env, seed, path, seconds=math.inf):
+def film(path, task, seed, clips, seconds=math.inf):
     """Films the first `seconds` of an episode for each of `clips`, in real time, at most 50 frames a second.
 
     A clip is a policy (None: random actions), weights to load into it or None, and a caption or None.
     """
     import imageio  # here: it takes a moment
 
-    rate = env.metadata.get("render_fps") or 30
-    skip = math.ceil(rate / 50)
-    options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    with gym.make(task, render_mode="rgb_array") as env:
+        rate = env.metadata.get("render_fps") or 30
+        skip = math.ceil(rate / 50)
+        options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
 
-    def write(file):
-        with imageio.get_writer(file.name, **options) as video:
-            for policy, weights, caption in clips:
-                if weights is not None:
-                    policy.load_state_dict(weights)
-                for frame in frames(env, policy, seed, skip, seconds * rate):
-                    video.append_data(with_caption(frame, caption))
+        def write(file):
+            with imageio.get_writer(file.name, **options) as video:
+                for policy, weights, caption in clips:
+                    if weights is not None:
+                        policy.load_state_dict(weights)
+                    for frame in frames(env, policy, seed, skip, seconds * rate):
+                        video.append_data(with_caption(frame, caption))
 
-    write_atomically(path, write)
+        write_atomically(path, write)
 
 
 def frames(env, policy, seed, skip, max_steps):
@@ -486,8 +489,6 @@ def with_caption(frame, caption):
 
 def plot_learning_curve(path, tables, title, reward_threshold):
     """Draws a run's returns with their spread beside its losses and mean Q, from the rows of its tables."""
-    if "ipykernel" not in sys.modules:  # in a notebook's `!command` its backend is set, but may be missing
-        os.environ.pop("MPLBACKEND", None)
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
@@ -557,16 +558,14 @@ class Run:
 
     SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # by `save`, for `_restore`
 
-    def __init__(self, script, config, evaluate, resume=None, processes=(0, 1, 0)):
+    def __init__(self, script, config, evaluate, resume=None, processes=(0, 1)):
         """Raises InputError for a config that cannot be used. Nothing is written yet."""
         self.script = script
         self.config = config
         self.evaluate_episode = evaluate
         self.resume = resume
-        self.rank, self.world_size, local_rank = processes
-        self.device = select_device(config.device, local_rank)
-        if config.batch_size > min(config.initial_collect_steps, config.replay_buffer_capacity * self.world_size):
-            raise InputError(f"--batch-size {config.batch_size} is more than the transitions stored at first: use less")
+        self.rank, self.world_size = processes
+        self.device = select_device(config.device)
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
@@ -649,8 +648,6 @@ class Run:
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
             path.unlink()  # of before: the tables are in the checkpoint, and a kill leaves temporary files
-        if self.best[1] is not None:
-            self._write("best_policy.pt", "policy", {"weights": self.best[1]})  # the file may be a later one's
         from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
 
         self.board = SummaryWriter(self.path)
@@ -737,10 +734,11 @@ class Run:
             return
         if policy:
             policy = self._cpu_policy()
-        pickled = pickle.dumps(policy)  # once for all episodes
-        call = (call_in_worker, self.evaluate_episode, pickled, self.pickled_task, None)
+        call = (evaluate_in_worker, self.evaluate_episode, pickle.dumps(policy), self.pickled_task)
         episodes = [self.pool.submit(*call, seed) for seed in evaluation_seeds(self.config)]
-        if not self._wait(episodes):
+        while futures.wait(episodes, timeout=0.1).not_done and not self.stop_request.is_set():
+            pass
+        if self.stop_request.is_set():
             return
         row, text = summarize([episode.result() for episode in episodes])
         self._add_row(table, step, row)
@@ -749,14 +747,6 @@ class Run:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             require_finite(policy, step)
             self._keep(step, row["average_return"], policy.state_dict())
-
-    def _wait(self, tasks):
-        """Waits for tasks of the workers. Returns False if a stop was requested before their end."""
-        while not self.stop_request.is_set():
-            _, running = futures.wait(tasks, timeout=0.1)
-            if not running:
-                return True
-        return False
 
     def _keep(self, step, average_return, weights):
         """Keeps the best weights so far, and for a film those at 0, 1/16, 1/4, 9/16 and all of the updates."""
@@ -767,17 +757,9 @@ class Run:
             self._write("best_policy.pt", "policy", {"weights": weights})
 
     def stop_if_requested(self, step):
-        """After Ctrl-C or SIGTERM: saves a checkpoint, tells how to continue, and raises KeyboardInterrupt.
-
-        Several processes exchange a message for it, at every 20th update and where one of them evaluates.
-        """
-        requested = self.stop_request.is_set()
-        if self.world_size > 1:
-            if step % 20 and step % self.config.eval_interval and step < self.config.num_iterations:
-                return
-            number = torch.tensor(float(requested))
-            average([number])
-            requested = number.item() > 0
+        """After Ctrl-C or SIGTERM: saves a checkpoint, tells how to continue, and raises KeyboardInterrupt."""
+        requested = torch.tensor(float(self.stop_request.is_set()))
+        average([requested])  # torchrun's processes stop together
         if not requested:
             return
         self.save(step)
@@ -796,10 +778,10 @@ class Run:
             return
         self.progress.close()
         self._plot()
-        policy = self._cpu_policy()
         if self.config.video:
-            self._film(policy)
+            self._film()
         with or_warn("exported policies"):
+            policy = self._cpu_policy()
             export_policy(self.path / "policy.pt2", policy, observation_shape)
             policy.load_state_dict(self.best[1])
             export_policy(self.path / "best_policy.pt2", policy, observation_shape)
@@ -810,20 +792,12 @@ class Run:
         title = f"{self.config.env_id}, seed {self.config.seed}"
         plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
 
-    def _film(self, policy):
+    def _film(self):
         say("filming the trained agent, a random one, and how it learned ...")
-        learning = [(policy, weights, caption) for caption, weights in self.snapshots]
-        films = {"learning": learning, "trained_agent": [(policy, None, None)], "random_agent": [(None, None, None)]}
+        policy = self._cpu_policy()
         seed = evaluation_seeds(self.config)[0]
-        tasks = {}
-        for name, clips in films.items():
-            path = self.path.absolute() / f"{name}.mp4"
-            seconds = 4 if name == "learning" else math.inf
-            call = (call_in_worker, film, pickle.dumps(clips), self.pickled_task, "rgb_array")
-            tasks[name] = self.pool.submit(*call, seed, path, seconds)
-        for name, task in tasks.items():
-            with or_warn(f"{name}.mp4"):
-                if not self._wait([task]):
-                    say(f"stopped while filming; to film: --resume '{self.path}'")
-                    raise KeyboardInterrupt
-                task.result()
+        learning = [(policy, weights, caption) for caption, weights in self.snapshots]
+        with or_warn("film"):
+            film(self.path / "trained_agent.mp4", self.task, seed, [(policy, None, None)])
+            film(self.path / "random_agent.mp4", self.task, seed, [(None, None, None)])
+            film(self.path / "learning.mp4", self.task, seed, learning, seconds=4)

@@ -294,7 +294,8 @@ class SACAgent(nn.Module):
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate, **adam)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], config.alpha_learning_rate, **adam)
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]  # what a checkpoint saves
+        # What a checkpoint saves. `load_state_dict` shares the moments it gets: to copy an optimizer, deepcopy them.
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
@@ -513,9 +514,8 @@ def train(config, resume=None):
     Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
-    processes = common.join_processes()  # of torchrun: rank, number of processes, rank on this machine
-    rank, world_size, _ = processes
-    with common.Run("sac_minitaur", config, evaluate, resume, processes) as run:  # its evaluations call `evaluate`
+    rank, world_size = common.join_processes()  # torchrun's; one process is number 0 of 1
+    with common.Run("sac_minitaur", config, evaluate, resume, (rank, world_size)) as run:  # it calls `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
         run.stack.callback(envs.close, terminate=True)  # is called at the run's end, after an error, too
@@ -539,8 +539,9 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode. So every checkpoint begins new episodes, also in a run that
-            # is not killed: a resumed run then repeats it. A cut episode is not terminated: its targets keep Q(s', a').
+            # gymnasium cannot save a task in mid-episode, and pybullet's restored contacts differ. So every checkpoint
+            # begins new episodes, also in a run that is not killed: a resumed run then repeats it. A cut episode is
+            # not terminated: its targets keep Q(s', a').
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])

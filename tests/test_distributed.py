@@ -44,7 +44,7 @@ def gradients_of_update():
     Critics do not move, so that the actor's gradients are those of the same critics, and do not normalize: each process
     does that within its own share. The actor's samples, which ranks draw apart, are its means.
     """
-    rank, world_size, _ = common.join_processes()
+    rank, world_size = common.join_processes()
     torch.manual_seed(0)
     still = {"critic_learning_rate": 0.0, "critic_batch_norm": False}
     config = sac_minitaur.Config(env_id="Pendulum-v1", actor_layers=(16,), critic_layers=(16,), **still)
@@ -129,13 +129,10 @@ def test_all_stop_with_one(tmp_path):
     assert len(set(first)) == 4  # the first observations of the four environments
 
 
-@pytest.mark.parametrize(
-    "size, said", [(25, "cannot be shared by 2 processes"), (258, "is more than the transitions stored at first")]
-)
-def test_batches_that_two_processes_cannot_take(size, said):
-    config = sac_minitaur.Config(batch_size=size, initial_collect_steps=256, replay_buffer_capacity=1000, device="cpu")
-    with pytest.raises(common.InputError, match=f"^--batch-size {size} {said}"):
-        common.Run(SCRIPT, config, sac_minitaur.evaluate, processes=(0, 2, 0))
+def test_a_batch_that_two_processes_cannot_share():
+    config = sac_minitaur.Config(batch_size=25, device="cpu")
+    with pytest.raises(common.InputError, match="^--batch-size 25 cannot be shared by 2 processes"):
+        common.Run(SCRIPT, config, sac_minitaur.evaluate, processes=(0, 2))
 
 
 def test_torchrun_ends_when_a_rank_is_killed(tmp_path):

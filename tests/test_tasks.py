@@ -258,8 +258,7 @@ def test_sac_learns_pendulum(tmp_path):
 
 def test_films_in_real_time_with_a_caption_for_each_policy(register, tmp_path):
     register(limit=50)
-    with gym.make("Mine-v0", render_mode="rgb_array") as env:
-        common.film([(None, None, None), (None, None, "a caption")], env, 0, tmp_path / "film.mp4")
+    common.film(tmp_path / "film.mp4", "Mine-v0", 0, [(None, None, None), (None, None, "a caption")])
     with imageio.get_reader(tmp_path / "film.mp4") as video:
         frames = [np.asarray(frame) for frame in video]
         assert video.get_meta_data()["fps"] == 50
@@ -274,7 +273,7 @@ def test_frames_that_cannot_be_filmed_cost_a_line(register, tmp_path, capsys):
         with pytest.raises(ValueError, match=re.escape(f"render returned {found}; needed: an array of uint8")):
             common.with_caption(frame, "a caption")
     path = train("dqn_cartpole", tmp_path / "run", env_id=register(fault="render", discrete=True), video=True)
-    assert "warning: no trained_agent.mp4 (the task's render returned NoneType" in capsys.readouterr().out
+    assert "warning: no film (the task's render returned NoneType" in capsys.readouterr().out
     assert not list(path.glob("*.mp4")) + list(path.glob(".tmp*"))
 
 
