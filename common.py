@@ -197,7 +197,8 @@ def find_task(config, action_space, training=True):
     """The gymnasium spec of --env-id, with a time limit, and its observation and action spaces.
 
     Raises InputError when the task is unknown, or has not the kind of `action_space` that the algorithm needs,
-    `gym.spaces.Discrete` or `Box`. An error of the task's own code is raised as it is.
+    `gym.spaces.Discrete` or `Box`; for `training` also when no episode can end between two checkpoints. An error of the
+    task's own code is raised as it is.
     """
     draw_without_display()
     name = f"--env-id {config.env_id}"
@@ -258,8 +259,8 @@ class ObservationScaling(torch.nn.Module):
 
         Bounds that nobody reaches are dropped: scaled by them, all observations would come near one number. If one is
         over 130 times wider than the data, all over 10 times are dropped. CartPole has no such bound. A number without
-        bounds is centred and scaled by its data if these lie beyond ±10. They then fill a quarter of [-1, 1], since
-        what a better policy sees lies farther out.
+        bounds is centred and scaled by its data if these lie beyond ±10. They then fill half of [-1, 1], since what a
+        better policy sees lies farther out.
         """
         low = observations.amin(0)
         high = observations.amax(0)
@@ -272,7 +273,7 @@ class ObservationScaling(torch.nn.Module):
             self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
         self.center.copy_(torch.where(large, (low + high) / 2, self.center))
-        self.half_range.copy_(torch.where(large, 4 * spread, self.half_range))
+        self.half_range.copy_(torch.where(large, 2 * spread, self.half_range))
 
     def forward(self, observation):
         return (observation - self.center) / self.half_range

@@ -57,8 +57,8 @@ class Config:
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     time_limit_terminates: bool = False  # ours (theirs: yes, in 2023): a time limit counts as an end of the task
-    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, a full copy): target ← target + τ (Q-network − target)
-    value_unit: bool = True  # ours (theirs: no): the network's output is Q, shifted and scaled: `fit_scaling`
+    target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, so no slow copy): Q̄ ← Q̄ + τ (Q − Q̄), in the weights
+    value_unit: bool = True  # ours (theirs: no): Q = offset + scale × the network's output: see `fit_scaling`
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q̄(s, ·) − Q̄(s, a))
     observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
@@ -71,12 +71,12 @@ class Config:
     log_interval: PositiveInt = 200  # updates between rows of train.csv
     eval_interval: PositiveInt = 1_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 10  # episodes in each evaluation
-    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode
+    checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode: see `train`
 
     @model_validator(mode="after")
     def _finite_value(self):
         if self.value_unit and self.gamma == 1:
-            raise ValueError("--gamma 1 makes an endless episode's value infinite: use less, or --no-value-unit")
+            raise ValueError("--value-unit divides by 1 − gamma: use a --gamma below 1, or --no-value-unit")
         return self
 
 
@@ -224,8 +224,9 @@ class DQNAgent(nn.Module):
     def fit_scaling(self, observations, rewards):
         """Fits the scales to observations (N, O) and rewards (N,) of random actions.
 
-        An output of 0 then means an episode that never ends: Q = mean reward / (1 − γ). CartPole's rewards are 1: with
-        γ = 0.99, Q = 100 + 100 × output, and an output of −1 means no more reward. Without rewards Q is the output.
+        Output 0 then stands for the Q of an episode that never ends and earns the mean reward: mean reward / (1 − γ).
+        CartPole's rewards are 1: with γ = 0.99, Q = 100 + 100 × output, and output −1 stands for no more reward. If all
+        rewards were 0, Q stays the output.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations)
@@ -254,7 +255,7 @@ class DQNAgent(nn.Module):
         """Update number `step`, from 0. Returns the scalars to log, as tensors on the device.
 
         Plain DQN: Q(s, a) takes a gradient step towards y = r + γ (1 − terminated) max Q̄(s', ·). Then the weights θ̄
-        of the target network follow the Q-network's: θ̄ ← θ̄ + τ (θ − θ̄). Each choice of ours is an `if` of its own.
+        of the target network follow the Q-network's: θ̄ ← θ̄ + τ (θ − θ̄). What we add is in the blocks marked "ours".
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
@@ -265,7 +266,7 @@ class DQNAgent(nn.Module):
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # (B,)
-            if config.advantage_learning:  # ours: widens the gap to the best action, so errors change it less
+            if config.advantage_learning:  # ours: lowers Q of worse actions, so errors seldom change which is best
                 target_q = self.q_values(self.target_network, s)  # Q̄(s, ·): (B, A)
                 y = y - config.advantage_learning * gap_to_best(target_q, a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
@@ -305,7 +306,7 @@ def collect_step(env, observation, action, buffer, run):
     next_observation, reward, terminated, truncated, info = env.step(action)
     if run.config.time_limit_terminates:  # theirs
         terminated = terminated or truncated
-    # The reset comes later: at an episode's end, too, next_observation is of this episode.
+    # The environment is reset only below, so next_observation is still this episode's own last observation.
     buffer.add(observation, action, reward, terminated, next_observation)
     run.env_steps += 1
     if terminated or truncated:
@@ -322,15 +323,15 @@ def train(config, resume=None):
     """
     config, checkpoint = common.continued(config, resume, "dqn_cartpole")
     with common.Run("dqn_cartpole", config, evaluate, resume) as run:  # its evaluations call `evaluate`
-        task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # a gymnasium spec
+        task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # task: a gymnasium spec
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
         env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later
         torch.manual_seed(config.seed)
         agent = DQNAgent(config, observation_space, action_space, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, math.prod(observation_space.shape), run.device)
-        start = run.begin(task, agent, buffer, checkpoint)  # restores the checkpoint; the updates done so far
+        start = run.begin(task, agent, buffer, checkpoint)  # restores a checkpoint. start: the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:  # not in a run that continues after this phase
+        if run.env_steps < config.initial_collect_steps:  # a resumed run has done this before
             observation, _ = env.reset(seed=common.derive_seed(config.seed))
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
@@ -338,8 +339,9 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode. So every checkpoint begins a new episode, also in a run that
-            # is not killed: a resumed run then repeats it. A cut episode is not terminated: its targets keep Q̄(s', ·).
+            # gymnasium cannot save a task in mid-episode. So every checkpoint begins a new episode, in every run: a run
+            # that is killed and resumed then does the same as one left alone. The cut is no termination: targets of the
+            # transitions before it keep Q̄(s', ·).
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observation, _ = env.reset(seed=common.derive_seed(config.seed, update))

@@ -7,15 +7,16 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor π samples its actions. Two critics estimate Q(s, a): the later rewards, and α times the later entropies. The
-entropy is the mean of −log π(a|s). The actor learns to make Q + α × entropy large: it earns much but stays random, and
-so it explores. α is tuned until the entropy has a given value. The critics move to a target:
+The actor π samples its actions. How random they are is the entropy, the mean of −log π(a|s); α is its weight. Two
+critics estimate Q(s, a): the rewards from action a on, and α × the entropies of the steps after it. The actor learns to
+make Q + α × entropy large: it earns much but stays random, and so it explores. α is tuned until the entropy has a given
+value. The critics move to a target:
 
     y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as in dqn_cartpole.py
 
 The minimum is over the two critics, not over actions. The actor uses it, too: an actor that maximizes one estimate
 exploits its errors. In the paper slow copies of the critics, the target critics, compute y. Ours compute it themselves,
-as in CrossQ: batch normalization makes their learning stable enough.
+as in CrossQ, a later variant of SAC (arXiv:1902.05605): batch normalization makes their learning stable enough.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -47,18 +48,18 @@ class Config:
     env_id: common.Task = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
-    initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, over environments and processes
+    initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, of all environments together
     collect_steps_per_iteration: PositiveInt = 1  # steps of each environment for each update
     num_envs: common.Count = 4  # ours (theirs: 1): environments stepped at once by each process, each in a worker
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
-    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): updates of critics for each of actor, α
+    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): critic updates for one of actor and α
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε. Keras has this value, but adds it before the bias correction
-    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but there not for α
+    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, which leaves α's at 0.9
     privileged_critics: bool = True  # ours (theirs: no): critics see speed, turning and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
@@ -67,9 +68,9 @@ class Config:
     observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): evaluated actor ← it + τ (trained actor − it)
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): average ← it + τ (actor − it); it is evaluated
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): × dimensions of an action; uniform has +0.69
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): for each number of an action; uniform: ln 2 = 0.69
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -107,7 +108,8 @@ TUTORIAL = {
 }
 
 
-# In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action
+# In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action.
+# The agent and the buffer take observations (…, S); the actor uses their first O numbers.
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -294,7 +296,7 @@ class SACAgent(nn.Module):
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate, **adam)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], config.alpha_learning_rate, **adam)
-        # What a checkpoint saves. `load_state_dict` shares the moments it gets: to copy an optimizer, deepcopy them.
+        # What a checkpoint saves. If your fork copies an optimizer, deepcopy its state: `load_state_dict` shares it.
         self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]
 
     def random_actions(self, count):
@@ -314,7 +316,7 @@ class SACAgent(nn.Module):
             variance = (rewards - mean).square().mean()
             common.average([variance])
             std = variance.sqrt()
-            # Rewards that were all equal stay as they are: their std is 0 but for rounding.
+            # Rewards that were all equal stay as they are. Rounding may make their std slightly more than 0.
             divisor = torch.where(std > 1e-6 * mean.abs(), std, 1.0)
             self.reward_scale.copy_(self.config.reward_scale_factor / divisor)
 
@@ -357,9 +359,9 @@ class SACAgent(nn.Module):
             q = self.critics(s, a)  # (2, B)
             next_q = self.target_critics(next_s, next_a)  # (2, B)
         else:
-            # Ours: one pass, as in CrossQ. In two passes batch norm would scale the stored a and the new a' by other
-            # means and variances, and Q(s, a) and Q(s', a') would be two functions. No gradient reaches next_q, because
-            # y is computed under no_grad.
+            # Ours: one pass, as in CrossQ. In two passes batch norm would scale the stored a and the new a' with
+            # different means and variances, and Q(s, a) and Q(s', a') would be two functions. No gradient reaches
+            # next_q, because y is computed under no_grad.
             self.critics.train()
             q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
@@ -369,7 +371,7 @@ class SACAgent(nn.Module):
 
         self.critic_optimizer.zero_grad()
         loss.backward()
-        # Several processes: the mean of their gradients, and of batch normalization's running statistics.
+        # Several processes: the mean of their gradients, and of batch normalization's running means and variances.
         statistics = [buffer for buffer in self.critics.buffers() if buffer.is_floating_point()]
         common.average([*(parameter.grad for parameter in self.critics.parameters()), *statistics])
         self.critic_optimizer.step()
@@ -434,7 +436,7 @@ def cuda_graph(agent, function):
             with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # computes nothing, replays do
                 metrics = function(recorded)
             for group in groups:
-                group["capturable"] = False  # True would be saved, and PyTorch warns of it in a step without a graph
+                group["capturable"] = False  # a checkpoint would have True, and a run without a graph would warn
         for graph_input, values in zip(recorded, batch):
             graph_input.copy_(values)  # a replay reads its batch from the recorded tensors
         graph.replay()
@@ -460,12 +462,12 @@ def evaluate(policy, env, seed):
 
 
 def make_training_env(task, privileged, main_process):
-    """The task as the agent sees it in training: actions in [-1, 1], flat observations, returns that are counted.
+    """The task as the agent sees it in training: actions in [-1, 1], flat observations, the return of each episode.
 
     With `privileged`, the environment's `privileged_observation` (S − O,), if it has one, follows the observation (O,).
     """
     if os.getpid() != main_process:  # AsyncVectorEnv makes one in the main process, too, to see its spaces
-        common.prepare_worker()
+        common.prepare_worker()  # ignores Ctrl-C, and ends with the main process
     env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
     low = env.action_space.low
     high = env.action_space.high
@@ -490,21 +492,21 @@ def make_vector_env(task, config):
     return gym.vector.AsyncVectorEnv([make] * config.num_envs, context=method, autoreset_mode=autoreset)
 
 
-def store(buffer, observations, actions, step, run):
+def store(buffer, observations, actions, result, run):
     """Stores the transitions of one vector step. Returns the observations to act on next: (K, S)."""
-    next_observations, rewards, terminated, truncated, infos = step
+    new_observations, rewards, terminated, truncated, infos = result
     ended = terminated | truncated
     if run.config.time_limit_terminates:  # theirs
         terminated = ended
-    # Where an episode ended, next_observations is already the next one's start. Its own end is in final_obs.
-    last_observations = next_observations.copy()
+    # Where an episode ended, new_observations is already the next one's start. Its own end is in final_obs.
+    next_observations = new_observations.copy()
     for i in np.flatnonzero(ended):
-        last_observations[i] = infos["final_obs"][i]
+        next_observations[i] = infos["final_obs"][i]
         episode = infos["final_info"]["episode"]
         run.log_episode(episode["r"][i], episode["l"][i])
-    buffer.add(observations, actions, rewards, terminated, last_observations)
+    buffer.add(observations, actions, rewards, terminated, next_observations)
     run.env_steps += len(rewards) * run.world_size
-    return next_observations
+    return new_observations
 
 
 def train(config, resume=None):
@@ -514,11 +516,11 @@ def train(config, resume=None):
     Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
-    rank, world_size = common.join_processes()  # torchrun's; one process is number 0 of 1
+    rank, world_size = common.join_processes()  # this process's number and their count, of torchrun; else 0 and 1
     with common.Run("sac_minitaur", config, evaluate, resume, (rank, world_size)) as run:  # it calls `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
-        run.stack.callback(envs.close, terminate=True)  # is called at the run's end, after an error, too
+        run.stack.callback(envs.close, terminate=True)  # also if an error comes before the `envs.close()` below
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
@@ -528,9 +530,9 @@ def train(config, resume=None):
             agent.update_actor = cuda_graph(agent, agent.update_actor)
         torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process
         numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process's environments
-        start = run.begin(task, agent, buffer, checkpoint)  # restores the checkpoint; the updates done so far
+        start = run.begin(task, agent, buffer, checkpoint)  # restores a checkpoint. start: the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:  # not in a run that continues after this phase
+        if run.env_steps < config.initial_collect_steps:  # a resumed run has done this before
             observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in numbers])
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
@@ -539,9 +541,9 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode, and pybullet's restored contacts differ. So every checkpoint
-            # begins new episodes, also in a run that is not killed: a resumed run then repeats it. A cut episode is
-            # not terminated: its targets keep Q(s', a').
+            # gymnasium cannot save a task in mid-episode, and pybullet does not restore contacts exactly. So every
+            # checkpoint begins new episodes, in every run: a run that is killed and resumed then does the same as one
+            # left alone. The cut is no termination: targets of the transitions before it keep Q(s', a').
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])
@@ -549,7 +551,7 @@ def train(config, resume=None):
                 run.evaluate(update, agent.policy)
             run.stop_if_requested(update)
 
-            for _ in range(config.collect_steps_per_iteration - 1):
+            for _ in range(config.collect_steps_per_iteration - 1):  # all but the last, which the update accompanies
                 actions = agent.act(observations)
                 observations = store(buffer, observations, actions, envs.step(actions), run)
             # The update learns from the steps before this one, while the simulators work.
@@ -615,7 +617,8 @@ class MinitaurBulletEnv(gym.Env):
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
     orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
-    Reward: metres forward in this step less 0.005 × |observed torques · motor velocities| in W × 0.002 s (one substep).
+    Reward: metres forward in this step − 0.005 × |observed torques · motor velocities| in W × 0.002 s. As in the
+    original the energy counts one substep of the five.
     Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
     """
 
@@ -672,7 +675,7 @@ class MinitaurBulletEnv(gym.Env):
         joints = (simulator.getJointInfo(robot, i) for i in range(simulator.getNumJoints(robot)))
         joint = {info[1].decode(): info[0] for info in joints}
         self.motor_joints = [joint[f"motor_{motor}_joint"] for motor in self.MOTORS]
-        knee_joints = [joint[f"knee_{motor}_link"] for motor in self.MOTORS]
+        knee_joints = [joint[f"knee_{motor}_link"] for motor in self.MOTORS]  # so the model names these joints
         for motor, knee, direction in zip(self.motor_joints, knee_joints, self.DIRECTION):
             simulator.resetJointState(robot, motor, direction * math.pi / 2)
             simulator.resetJointState(robot, knee, direction * self.KNEE_ANGLE)
@@ -717,13 +720,14 @@ class MinitaurBulletEnv(gym.Env):
 
     @staticmethod
     def _motor_angles(action):
-        """The angles in rad that the eight motors are to reach: extension turns a leg's two alike, swing oppositely.
+        """The angles in rad that the eight motors are to reach, from pybullet's `ConvertFromLegModel`.
 
-        In the action's own precision and in this order: with float32 actions the original computes in float32 too.
+        Extension turns the two motors of a leg by the same angle, swing by opposite angles, mirrored on the right. The
+        order of operations and the action's own precision are the original's: so are the roundings.
         """
         swing, extension = np.repeat(action[:4], 2), np.repeat(action[4:], 2)
         per_swing = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)  # rad
-        return math.pi + -math.pi / 4 * (extension + 1.5) + per_swing * swing  # 1.5: pybullet's offset_for_singularity
+        return math.pi - math.pi / 4 * (extension + 1.5) + per_swing * swing  # 1.5: pybullet's offset_for_singularity
 
     def _substep(self, command):
         """Drives the motors towards the angles `command` for 0.002 s, in the order of pybullet's motor.py."""
@@ -767,7 +771,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # its finalizer disconnects, and only once: a later simulation may reuse its number
+        self.simulator = None  # its finalizer disconnects once. A second time could hit a newer one of the same number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:

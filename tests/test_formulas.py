@@ -162,7 +162,7 @@ def test_bounds_that_nobody_reaches_are_dropped():
     """One of ±1e8 makes all over ten times wider than the data suspect. ±2 of the third stay."""
     data = [[0.2, 300.0, -0.5], [-0.3, -300, 0.5]]
     scaling = fitted([-35, -1e8, -2], [35, 1e8, 2], data)
-    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 1])), torch.tensor([2.0, 0.5, 0.5]))
+    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 1])), torch.tensor([2.0, 1.0, 0.5]))
     scaling = fitted([-30, -2], [30, 2], [[0.25, 1.0], [-0.25, -1]])  # within 130 times
     assert scaling(torch.tensor([15.0, 1])).tolist() == [0.5, 0.5]
 
@@ -170,7 +170,7 @@ def test_bounds_that_nobody_reaches_are_dropped():
 def test_numbers_without_bounds_are_scaled_only_beyond_ten():
     inf = np.inf
     scaling = fitted([-inf] * 4, [inf] * 4, [[1000.0, -3, 30000, 5000], [1002, 9, 30100, 5000]])
-    assert scaling(torch.tensor([1002.0, 9, 30050, 5001])).tolist() == [0.25, 9, 0, 0.25]
+    assert scaling(torch.tensor([1002.0, 9, 30050, 5001])).tolist() == [0.5, 9, 0, 0.5]
 
 
 # SAC
