@@ -1,6 +1,7 @@
 """What both scripts need besides their algorithms: the command line, files, workers, and a run's tables and films.
 
-No loss and no replay buffer is here, and no training environment is stepped here.
+No loss and no replay buffer is here, and no training environment is stepped here. One class is part of what is learned
+with: `ObservationScaling`, in both policies.
 """
 
 import argparse
@@ -37,7 +38,7 @@ from pydantic_core import to_json, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 4  # of checkpoints and policies
-MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video")
+MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video", "run_dir")
 
 # The types of the scripts' options
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
@@ -65,8 +66,7 @@ def run_main(main):
         main()
         return
     except InputError as error:
-        if os.environ.get("RANK", "0") == "0":  # of torchrun's processes, which mostly fail alike, one tells
-            print(f"error: {error}", file=sys.stderr, flush=True)
+        print(f"error: {error}", file=sys.stderr, flush=True)
         status = 2
     except KeyboardInterrupt:
         status = 130
@@ -106,7 +106,7 @@ def read_command_line(script, config_class, tutorial, description):
         _, default = read_file(given.resume / "checkpoint.pt", "checkpoint", script, config_class)
     elif given.evaluate is not None:
         _, saved = read_file(given.evaluate, "policy", script, config_class)
-        default = dataclasses.replace(saved, video=True)
+        default = dataclasses.replace(saved, video=True)  # a run without films can be filmed here
     else:
         default = config_class(**tutorial) if given.tutorial else config_class()
 
@@ -138,7 +138,7 @@ def continued(config, resume, script):
         old = getattr(saved, field.name)
         if field.name in MAY_CHANGE_ON_RESUME:
             changes[field.name] = new
-        elif new not in (old, field.default):
+        elif new not in (old, field.default):  # from Python a default may mean that nothing was given
             flag = "--" + field.name.replace("_", "-")
             raise InputError(f"{flag} {new} differs from the {old} of the run to resume: leave it out")
     return dataclasses.replace(saved, **changes), checkpoint
@@ -212,10 +212,10 @@ def find_task(config, action_space, training=True):
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
                 say(f"warning: each evaluation's {wrapper} starts anew: it cannot know the statistics of training")
-        task = copy.copy(gym.registry[env.unwrapped.spec.id])
+        task = copy.copy(gym.registry[env.unwrapped.spec.id])  # env.spec would add the task's own wrappers again
         task.max_episode_steps = env.spec.max_episode_steps  # the flag's, if there is one
     if task.max_episode_steps is None:
-        task.max_episode_steps = 10_000  # an evaluation has to end
+        task.max_episode_steps = 10_000  # an evaluation has to end. The task itself may end its episodes sooner
     elif training and task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
         what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {task.max_episode_steps} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
@@ -257,20 +257,17 @@ class ObservationScaling(torch.nn.Module):
     def fit(self, observations):
         """Corrects the scales by observations (N, O) of random actions.
 
-        Bounds that nobody reaches are dropped: scaled by them, all observations would come near one number. If one is
-        over 130 times wider than the data, all over 10 times are dropped. CartPole has no such bound. A number without
-        bounds is centred and scaled by its data if these lie beyond ±10. They then fill half of [-1, 1], since what a
-        better policy sees lies farther out.
+        Bounds over 100 times wider than the data are dropped: scaled by them, all observations would come near one
+        number. CartPole's are at most 84 times wider. A number without bounds is centred and scaled by its data if
+        these lie beyond ±10. They then fill half of [-1, 1], since what a better policy sees lies farther out.
         """
         low = observations.amin(0)
         high = observations.amax(0)
-        average([low, high])  # in place, over torchrun's processes
+        average([low, high])  # in place: the processes' mean extremes, so that all have the same scales
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        times_wider = self.half_range / spread
-        if (self.bounded & (times_wider > 130)).any():
-            self.bounded &= times_wider <= 10
-            self.center[~self.bounded] = 0.0
-            self.half_range[~self.bounded] = 1.0
+        self.bounded &= self.half_range <= 100 * spread
+        self.center[~self.bounded] = 0.0
+        self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
         self.center.copy_(torch.where(large, (low + high) / 2, self.center))
         self.half_range.copy_(torch.where(large, 2 * spread, self.half_range))
@@ -331,9 +328,10 @@ def average(tensors):
 
 
 def start_method(env_id):
-    """How to start workers: "fork" is the quickest, but copies no threads and no CUDA of the main process.
+    """How to start workers: "fork" is the quickest, but a forked process lacks the main process's threads and CUDA.
 
-    A package's task (package:Task-v0) and any task on JAX may wait for these for ever. So their workers start clean.
+    A package (package:Task-v0) or JAX may have started threads when it was imported, and would wait for them for ever.
+    So these tasks' workers start clean.
     """
     if sys.platform != "linux":
         return "spawn"
@@ -346,7 +344,7 @@ def start_method(env_id):
 @contextlib.contextmanager
 def worker_pool(size, method):
     """A pool of `size` processes. They, and the environments' processes of a run that fails, are killed at its end."""
-    others = set(multiprocessing.active_children())
+    children_before = set(multiprocessing.active_children())
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a new process inherits
     for _ in range(size):
@@ -355,7 +353,7 @@ def worker_pool(size, method):
     try:
         yield pool
     finally:
-        for process in set(multiprocessing.active_children()) - others:
+        for process in set(multiprocessing.active_children()) - children_before:
             process.kill()
         pool.shutdown(cancel_futures=True)
 
@@ -380,7 +378,7 @@ def prepare_worker():
 
 @functools.cache
 def worker_environment(task):
-    """The environment of this worker, of a pickled task. It is made once: a simulator may take long to start."""
+    """The environment of this worker, made once: a simulator may take long to start. `task` is pickled, to be a key."""
     return gym.make(pickle.loads(task))
 
 
@@ -450,7 +448,7 @@ def film(path, task, seed, clips, seconds=math.inf):
         options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
 
         def write(file):
-            with imageio.get_writer(file.name, **options) as video:
+            with imageio.get_writer(file.name, **options) as video:  # ffmpeg opens it by its name
                 for policy, weights, caption in clips:
                     if weights is not None:
                         policy.load_state_dict(weights)
@@ -494,7 +492,9 @@ def plot_learning_curve(path, tables, title, reward_threshold):
 
     figure = Figure(figsize=(12, 4), layout="constrained")
     returns, losses, values = figure.subplots(1, 3)
-    steps, mean, spread = [[row[name] for row in tables["eval"]] for name in ("step", "average_return", "std_return")]
+    steps = [row["step"] for row in tables["eval"]]
+    mean = [row["average_return"] for row in tables["eval"]]
+    spread = [row["std_return"] for row in tables["eval"]]
     returns.plot(steps, mean, marker=".", label="deterministic policy, mean ± std")
     returns.fill_between(steps, np.subtract(mean, spread), np.add(mean, spread), alpha=0.2)
     for row in tables["random"]:
@@ -530,6 +530,7 @@ def stop_signals():
         if requested.is_set() and number == signal.SIGINT:
             raise KeyboardInterrupt
         requested.set()
+        # Not print: the signal may have interrupted one.
         os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
 
     numbers = (signal.SIGINT, signal.SIGTERM)
@@ -597,7 +598,7 @@ class Run:
     def begin(self, task, agent, buffer, checkpoint):
         """Restores the checkpoint, begins the files, evaluates random actions. Returns the number of updates done."""
         self.task = task
-        self.pickled_task = cloudpickle.dumps(task)  # once: by these bytes a worker knows the environment it has made
+        self.pickled_task = cloudpickle.dumps(task)
         self.agent = agent
         self.buffer = buffer
         step = self._restore(checkpoint) if checkpoint else 0
@@ -623,9 +624,10 @@ class Run:
             self.agent.load_state_dict(saved["agent"])
             for optimizer, state in zip(self.agent.optimizers, saved["optimizers"], strict=True):
                 optimizer.load_state_dict(state)
-            for name, rows in own["replay"].items():
-                getattr(self.buffer, name)[: len(rows)] = rows
-        except (AttributeError, RuntimeError, ValueError) as error:
+            for name, value in vars(self.buffer).items():
+                if torch.is_tensor(value):
+                    value[: own["size"]] = own["replay"][name]
+        except (KeyError, RuntimeError, ValueError) as error:
             what = f"does not fit this script's networks, optimizers and replay ({one_line(error)})"
             raise InputError(f"{self.path} {what}: continue it with the script that saved it") from None
         self.buffer.size = own["size"]
@@ -663,7 +665,7 @@ class Run:
         own = {"replay": {}, "size": buffer.size, "position": buffer.position, "random": torch.get_rng_state()}
         for name, value in vars(buffer).items():
             if torch.is_tensor(value):  # (capacity, …)
-                own["replay"][name] = value[: buffer.size].to("cpu", copy=True)
+                own["replay"][name] = value[: buffer.size].to("cpu", copy=True)  # a slice would save all rows
         if self.device.type == "cuda":
             own["cuda_random"] = torch.cuda.get_rng_state(self.device)
         processes = [own] * self.world_size if self.rank == 0 else None
@@ -772,11 +774,12 @@ class Run:
 
     def finish(self, step, observation_shape):
         """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
-        self.save(step)
+        self.save(step)  # before this evaluation, which a longer run would not play
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
         if self.rank:
             return
+        self.stop_request.set()  # all is saved: from here on Ctrl-C stops at once
         self.progress.close()
         self._plot()
         if self.config.video:

@@ -243,7 +243,7 @@ class DQNAgent(nn.Module):
         """The epsilon-greedy action for a flat numpy observation (O,)."""
         if torch.rand((), generator=self.generator) < self.config.epsilon:
             return self.random_action()
-        batch = torch.from_numpy(observation)[None].to(self.device)
+        batch = torch.as_tensor(observation, dtype=torch.float32, device=self.device)[None]
         with torch.inference_mode():
             return int(self.policy(batch))
 

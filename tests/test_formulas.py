@@ -124,6 +124,7 @@ def test_dqn_acts_greedily_but_for_a_part_of_the_actions():
     assert torch.equal(agent.policy(observations), greedy) and greedy.sum() == pytest.approx(2000, abs=50)
     action = agent.policy.act(observations[0].numpy())
     assert action == greedy[0] and type(action) is np.int64  # as its space's samples
+    assert agent.act(np.zeros(4)) in (0, 1)  # float64
     actions = torch.tensor([agent.act(observation) for observation in observations.numpy()])
     # One half of the random actions is greedy by chance: 0.85, with a standard deviation of 0.006.
     assert (actions == greedy).float().mean() == pytest.approx(1 - 0.3 / 2, abs=0.025)
@@ -159,12 +160,10 @@ def test_bounds_are_mapped_to_one():
 
 
 def test_bounds_that_nobody_reaches_are_dropped():
-    """One of ±1e8 makes all over ten times wider than the data suspect. ±2 of the third stay."""
-    data = [[0.2, 300.0, -0.5], [-0.3, -300, 0.5]]
-    scaling = fitted([-35, -1e8, -2], [35, 1e8, 2], data)
-    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 1])), torch.tensor([2.0, 1.0, 0.5]))
-    scaling = fitted([-30, -2], [30, 2], [[0.25, 1.0], [-0.25, -1]])  # within 130 times
-    assert scaling(torch.tensor([15.0, 1])).tolist() == [0.5, 0.5]
+    """Of 35 and 1e8, more than 100 times wider than the data. 20 and 2 stay."""
+    data = [[0.25, 300.0, 0.25, 0.5], [-0.25, -300, -0.25, -0.5]]
+    scaling = fitted([-35, -1e8, -20, -2], [35, 1e8, 20, 2], data)
+    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 10, 1])), torch.tensor([2.0, 1.0, 0.5, 0.5]))
 
 
 def test_numbers_without_bounds_are_scaled_only_beyond_ten():

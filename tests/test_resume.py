@@ -109,7 +109,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
         ("raised", [*resume, "--num-iterations", 300], partial(update, die), killed),
         ("checkpoint at 200", resume, die_in_the_second_checkpoint, killed),
         ("evaluation at 300", resume, partial(second_evaluation, interrupt), 130),
-        ("film", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, die), killed),
+        ("film", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, interrupt), 130),
     )
     for name, arguments, hook, status in stages:
         run = Process(script, arguments, tmp_path / name, hook)
