@@ -117,7 +117,7 @@ def draw(name, title, threshold, published):
 
 def main():
     for name in sorted({path.parents[1].relative_to(RESULTS).as_posix() for path in RESULTS.glob("**/eval.csv")}):
-        if name in ("dqn_cartpole", "dqn_cartpole_v1", "dqn_cartpole_130000"):
+        if name in ("dqn_cartpole", "dqn_cartpole_v1"):
             print_table(name, goal=475 if "_v1" in name else 200, late=10_000)
         elif "pendulum" in name:
             print_table(name, goal=-200, late=5_000)

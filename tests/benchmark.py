@@ -1,8 +1,7 @@
-"""Times this checkout and another one in turn, so that a drift of the machine's speed touches both alike.
+"""How soon the Minitaur runs, in this checkout and another one in turn: a drift of the machine's speed touches both.
 
     git worktree add /tmp/other COMMIT
-    python tests/benchmark.py /tmp/other | tee speed.csv            # 15 minutes
-    python tests/benchmark.py /tmp/other 400 401 | tee until_25.csv  # for these seeds, how long until the robot runs
+    python tests/benchmark.py /tmp/other 400 401 402 | tee until_25.csv  # for these seeds, ten minutes each
 
 Nothing else should run on the machine. Quote the ratios rather than the seconds.
 """
@@ -16,14 +15,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-REPEATS = 3
 RUNS = 25  # the return of a Minitaur that runs
-
-
-def start(checkout, script, run_dir, *flags):
-    command = [sys.executable, f"{script}.py", "--no-video", "--run-dir", run_dir, *flags]
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen(list(map(str, command)), cwd=checkout, **silent)
+FLAGS = "--no-video --eval-interval 2500 --log-interval 2500 --num-eval-episodes 10".split()
 
 
 def rows(path):
@@ -34,27 +27,11 @@ def rows(path):
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
-def whole_command(checkout, run_dir, script, *flags):
-    """Seconds of a command from its start to its end."""
-    begin = time.perf_counter()
-    if start(checkout, script, run_dir, *flags).wait():
-        sys.exit(f"{script}.py {flags} failed in {checkout}")
-    return time.perf_counter() - begin
-
-
-def thousand_updates(checkout, run_dir):
-    """Seconds of SAC's updates 1 000 to 2 000 on the Minitaur, its environments included."""
-    flags = ("--num-iterations", 2_000, "--log-interval", 1_000, "--num-eval-episodes", 1)
-    whole_command(checkout, run_dir, "sac_minitaur", *flags)
-    first, second = rows(run_dir / "train.csv")
-    return second["seconds"] - first["seconds"]
-
-
 def until_it_runs(checkout, run_dir, seed):
-    """Seconds until SAC's first evaluation of a return of 25, without the evaluations' own time."""
-    flags = ("--seed", seed, "--eval-interval", 2_500, "--log-interval", 2_500, "--num-eval-episodes", 10)
+    """Seconds until the first evaluation of a return of 25, without the evaluations' own time."""
+    command = [sys.executable, "sac_minitaur.py", "--seed", seed, "--run-dir", str(run_dir), *FLAGS]
     begin = time.perf_counter()
-    process = start(checkout, "sac_minitaur", run_dir, *flags)
+    process = subprocess.Popen(command, cwd=checkout, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     evaluations = []
     while not evaluations or evaluations[-1]["average_return"] < RUNS:
         if process.poll() is not None:
@@ -71,22 +48,14 @@ def until_it_runs(checkout, run_dir, seed):
 
 def main():
     other, *seeds = sys.argv[1:]
-    measures = {f"SAC until a return of {RUNS}, seed {seed}": (until_it_runs, seed) for seed in seeds}
-    if not seeds:
-        for repeat in range(REPEATS):
-            measures[f"DQN, the default command {repeat}"] = (whole_command, "dqn_cartpole")
-            measures[f"DQN, one update {repeat}"] = (whole_command, "dqn_cartpole", "--num-iterations", 1)
-            measures[f"SAC, 1 000 updates {repeat}"] = (thousand_updates,)
-    table = csv.writer(sys.stdout, lineterminator="\n")
-    table.writerow(("measured", "this, seconds", "other, seconds", "ratio"))
-    for name, (measure, *arguments) in measures.items():
+    print("seed,this (seconds),other (seconds),ratio")
+    for seed in seeds:
         seconds = []
         for checkout in (ROOT, Path(other)):
             with tempfile.TemporaryDirectory() as directory:
-                seconds.append(measure(checkout, Path(directory) / "run", *arguments))
+                seconds.append(until_it_runs(checkout, Path(directory) / "run", seed))
         this, that = seconds
-        table.writerow((name, f"{this:.1f}", f"{that:.1f}", f"{this / that:.2f}"))
-        sys.stdout.flush()
+        print(f"{seed},{this:.1f},{that:.1f},{this / that:.2f}", flush=True)
 
 
 if __name__ == "__main__":

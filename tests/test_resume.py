@@ -8,14 +8,12 @@ import os
 import signal
 import time
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import common
-import dqn_cartpole
 import sac_minitaur
 from runs import AGENTS, MODULES, ROOT, Process, assert_same_run, before_call, checkpoint, die, flags
 from runs import interrupt, read_command_line, read_csv, rows, run_python, session, wait_until
@@ -144,17 +142,6 @@ def test_what_may_change(script, reference):
     saved = module.Config(**state["config"])
     assert config == dataclasses.replace(saved, num_iterations=310, num_threads=2, video=True)
     assert config.batch_size == 24
-
-
-def test_a_csv_keeps_its_columns(tmp_path):
-    """A metric that appears later goes to TensorBoard alone. One that is missing later is nan."""
-    run = common.Run("dqn_cartpole", dqn_cartpole.Config(run_dir=tmp_path, device="cpu"), None)
-    shown = []
-    run.board = SimpleNamespace(add_scalar=lambda *scalar: shown.append(scalar))
-    run._add_row("train", 20, {"loss": 1.5})
-    run._add_row("train", 40, {"one": 1.0})
-    assert rows(tmp_path / "train.csv") == [["step", "env_steps", "loss"], ["20", "0", "1.5"], ["40", "0", "nan"]]
-    assert ("train/loss", 1.5, 20) in shown and ("train/one", 1.0, 40) in shown
 
 
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
