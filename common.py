@@ -1,7 +1,7 @@
 """What both scripts need besides their algorithms: the command line, files, workers, and a run's tables and films.
 
-No loss and no replay buffer is here, and no training environment is stepped here. One class is part of what is learned
-with: `ObservationScaling`, in both policies.
+No loss and no replay buffer is here, and no training environment is stepped here. One class belongs to the learning
+itself: `ObservationScaling`, a part of both policies.
 """
 
 import argparse
@@ -38,7 +38,7 @@ from pydantic_core import to_json, to_jsonable_python
 from tqdm import tqdm
 
 FILE_FORMAT = 4  # of checkpoints and policies
-MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video", "run_dir")
+MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video")
 
 # The types of the scripts' options
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, hide_input_in_errors=True)
@@ -130,6 +130,7 @@ def continued(config, resume, script):
     if resume is None:
         return config, None
     checkpoint, saved = read_file(Path(resume) / "checkpoint.pt", "checkpoint", script, type(config))
+    saved = dataclasses.replace(saved, run_dir=Path(resume))  # where it lies now
     if config.num_iterations < saved.num_iterations:
         raise InputError(f"--num-iterations {config.num_iterations} is less than the run's {saved.num_iterations}")
     changes = {}
@@ -212,10 +213,10 @@ def find_task(config, action_space, training=True):
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
                 say(f"warning: each evaluation's {wrapper} starts anew: it cannot know the statistics of training")
-        task = copy.copy(gym.registry[env.unwrapped.spec.id])  # env.spec would add the task's own wrappers again
+        task = copy.copy(gym.registry[env.unwrapped.spec.id])  # env.spec also lists the task's own wrappers
         task.max_episode_steps = env.spec.max_episode_steps  # the flag's, if there is one
     if task.max_episode_steps is None:
-        task.max_episode_steps = 10_000  # an evaluation has to end. The task itself may end its episodes sooner
+        task.max_episode_steps = 10_000  # for evaluations; in training we trust that the task ends its episodes
     elif training and task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
         what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {task.max_episode_steps} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
@@ -257,15 +258,16 @@ class ObservationScaling(torch.nn.Module):
     def fit(self, observations):
         """Corrects the scales by observations (N, O) of random actions.
 
-        Bounds over 100 times wider than the data are dropped: scaled by them, all observations would come near one
-        number. CartPole's are at most 84 times wider. A number without bounds is centred and scaled by its data if
-        these lie beyond ±10. They then fill half of [-1, 1], since what a better policy sees lies farther out.
+        Bounds over 130 times wider than the data are dropped: scaled by them, all observations would come near one
+        number. (CartPole's are up to 84 times wider. A byte that was constant, half its range 127.5, keeps its bounds.)
+        A number without bounds is centred and scaled by its data if these lie beyond ±10. They then fill half of
+        [-1, 1], since what a better policy sees lies farther out.
         """
         low = observations.amin(0)
         high = observations.amax(0)
         average([low, high])  # in place: the processes' mean extremes, so that all have the same scales
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        self.bounded &= self.half_range <= 100 * spread
+        self.bounded &= self.half_range <= 130 * spread
         self.center[~self.bounded] = 0.0
         self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
@@ -277,12 +279,12 @@ class ObservationScaling(torch.nn.Module):
 
 
 def derive_seed(seed, *key):
-    """A 32-bit seed from a run's seed and a key: the number of an environment, and that of an update or episode."""
+    """A 32-bit seed from a run's seed and a key: numbers of the environment, update or episode that it is for."""
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
 
 
 def evaluation_seeds(config):
-    """The seeds of the episodes that every evaluation plays. No environment in training has the number 2**32 - 1."""
+    """The seeds of every evaluation's episodes. Training has none of them: its environments' numbers are small."""
     return [derive_seed(config.seed, 2**32 - 1, i) for i in range(config.num_eval_episodes)]
 
 
@@ -343,10 +345,14 @@ def start_method(env_id):
 
 @contextlib.contextmanager
 def worker_pool(size, method):
-    """A pool of `size` processes. They, and the environments' processes of a run that fails, are killed at its end."""
+    """A pool of `size` processes.
+
+    At the end it kills all processes that began since: its own, and SAC's environments if a run failed before it closed
+    them.
+    """
     children_before = set(multiprocessing.active_children())
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which a new process inherits
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # new processes inherit it, until `prepare_worker`
     for _ in range(size):
         pool.submit(int)  # starts a process
     signal.signal(signal.SIGINT, handler)
@@ -359,7 +365,7 @@ def worker_pool(size, method):
 
 
 def prepare_worker():
-    """Prepares a worker process: Ctrl-C is the main process's, and it ends with that, even when that is killed."""
+    """Makes a worker ignore Ctrl-C, which the main process handles, and end with that process, even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     draw_without_display()
@@ -459,7 +465,7 @@ def film(path, task, seed, clips, seconds=math.inf):
 
 
 def frames(env, policy, seed, skip, max_steps):
-    """The pictures of one episode: every one of `skip` steps, and the last."""
+    """The pictures of one episode: one of every `skip` steps, and the last."""
     observation, _ = env.reset(seed=seed)
     env.action_space.seed(seed)
     step = 0
@@ -527,8 +533,10 @@ def stop_signals():
     requested = threading.Event()
 
     def request_stop(number, _):
-        if requested.is_set() and number == signal.SIGINT:
-            raise KeyboardInterrupt
+        if requested.is_set():
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            return
         requested.set()
         # Not print: the signal may have interrupted one.
         os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
@@ -571,7 +579,7 @@ class Run:
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
-        self.path = Path(resume or config.run_dir or Path("runs") / name)
+        self.path = Path(config.run_dir or Path("runs") / name)
         # The config as plain values for files. The directory is not among them: a run may be moved.
         self.plain_config = to_jsonable_python(dataclasses.asdict(config) | {"run_dir": None})
         self.env_steps = 0
@@ -603,7 +611,7 @@ class Run:
         self.buffer = buffer
         step = self._restore(checkpoint) if checkpoint else 0
         self.last_logged = (step, time.perf_counter())
-        hidden = True if self.rank else None  # None: only on a terminal
+        hidden = True if self.rank else None  # None: shown only on a terminal
         self.progress = tqdm(total=self.config.num_iterations, initial=step, unit="step", disable=hidden)
         self.stack.callback(self.progress.close)
         if self.rank == 0:
@@ -650,7 +658,7 @@ class Run:
         text = to_json(self.plain_config, indent=2) + b"\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
-            path.unlink()  # of before: the tables are in the checkpoint, and a kill leaves temporary files
+            path.unlink()  # left before a resume: the events are written anew below, and a kill leaves .tmp files
         from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
 
         self.board = SummaryWriter(self.path)
@@ -774,7 +782,7 @@ class Run:
 
     def finish(self, step, observation_shape):
         """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
-        self.save(step)  # before this evaluation, which a longer run would not play
+        self.save(step)  # first: a longer run, which --resume may make of it, would not play this evaluation
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
         if self.rank:

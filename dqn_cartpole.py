@@ -133,7 +133,7 @@ class Policy(nn.Module):
     def forward(self, observation):
         """Actions (batch,) for raw observations (batch, …)."""
         output = self.q_network(self.scaling(observation.flatten(1)))
-        return output.argmax(1)  # also of Q = offset + scale × output, because scale > 0
+        return output.argmax(1)  # the largest Q, too: Q = offset + scale × output, with scale > 0
 
     @torch.inference_mode()
     def act(self, observation):
@@ -224,9 +224,9 @@ class DQNAgent(nn.Module):
     def fit_scaling(self, observations, rewards):
         """Fits the scales to observations (N, O) and rewards (N,) of random actions.
 
-        Output 0 then stands for the Q of an episode that never ends and earns the mean reward: mean reward / (1 − γ).
-        CartPole's rewards are 1: with γ = 0.99, Q = 100 + 100 × output, and output −1 stands for no more reward. If all
-        rewards were 0, Q stays the output.
+        So the network learns numbers near 1, not near 100. Output 0 then stands for the Q of an episode that never ends
+        and earns the mean reward: mean reward / (1 − γ). CartPole's rewards are 1: with γ = 0.99, Q = 100 + 100 ×
+        output, and output −1 stands for no more reward. If all rewards were 0, Q stays the output.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations)
@@ -266,7 +266,7 @@ class DQNAgent(nn.Module):
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # (B,)
-            if config.advantage_learning:  # ours: lowers Q of worse actions, so errors seldom change which is best
+            if config.advantage_learning:  # ours: a wider gap to worse actions, so errors seldom change which is best
                 target_q = self.q_values(self.target_network, s)  # Q̄(s, ·): (B, A)
                 y = y - config.advantage_learning * gap_to_best(target_q, a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
@@ -339,9 +339,9 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode. So every checkpoint begins a new episode, in every run: a run
-            # that is killed and resumed then does the same as one left alone. The cut is no termination: targets of the
-            # transitions before it keep Q̄(s', ·).
+            # gymnasium cannot save a task in mid-episode, so a resumed run begins a new episode at its checkpoint. One
+            # left alone does so, too, at every checkpoint: both are the same to the bit. The cut is no termination: the
+            # targets of the transitions before it keep Q̄(s', ·).
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observation, _ = env.reset(seed=common.derive_seed(config.seed, update))

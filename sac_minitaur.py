@@ -53,7 +53,7 @@ class Config:
     num_envs: common.Count = 4  # ours (theirs: 1): environments stepped at once by each process, each in a worker
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
-    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): critic updates for one of actor and α
+    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): actor and α move in every third update
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
@@ -68,9 +68,9 @@ class Config:
     observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): average ← it + τ (actor − it); it is evaluated
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): the policy averages actors: see `soft_update`
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): for each number of an action; uniform: ln 2 = 0.69
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): a density's may be negative; uniform has ln 2 = 0.69
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -296,7 +296,7 @@ class SACAgent(nn.Module):
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate, **adam)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], config.alpha_learning_rate, **adam)
-        # What a checkpoint saves. If your fork copies an optimizer, deepcopy its state: `load_state_dict` shares it.
+        # What a checkpoint saves. (`a.load_state_dict(b.state_dict())` makes two optimizers share moments: deepcopy.)
         self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]
 
     def random_actions(self, count):
@@ -520,7 +520,7 @@ def train(config, resume=None):
     with common.Run("sac_minitaur", config, evaluate, resume, (rank, world_size)) as run:  # it calls `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
-        run.stack.callback(envs.close, terminate=True)  # also if an error comes before the `envs.close()` below
+        run.stack.callback(envs.close, terminate=True)  # an ExitStack: closes them after an error, too
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
@@ -541,9 +541,9 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode, and pybullet does not restore contacts exactly. So every
-            # checkpoint begins new episodes, in every run: a run that is killed and resumed then does the same as one
-            # left alone. The cut is no termination: targets of the transitions before it keep Q(s', a').
+            # gymnasium cannot save a task in mid-episode, and pybullet does not restore contacts exactly. So a resumed
+            # run begins new episodes at its checkpoint. One left alone does so, too, at every checkpoint: both are the
+            # same to the bit. The cut is no termination: the targets of the transitions before it keep Q(s', a').
             if update == start or update % config.checkpoint_interval == 0:
                 run.save(update)
                 observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])
@@ -663,7 +663,10 @@ class MinitaurBulletEnv(gym.Env):
         return self._observation(), {}
 
     def _build(self):
-        """Loads plane and robot into an empty simulation, in the start pose, its legs closed to four-bar linkages."""
+        """Loads plane and robot into an empty simulation, in the start pose.
+
+        A leg has two motors and below each a shin, on the joint called knee. A pin joins the two shins at the foot.
+        """
         simulator = self.simulator
         simulator.resetSimulation()
         simulator.setPhysicsEngineParameter(numSolverIterations=self.SOLVER_ITERATIONS)
@@ -771,7 +774,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # its finalizer disconnects once. A second time could hit a newer one of the same number
+        self.simulator = None  # its finalizer disconnects. Twice could close a newer simulation with the same number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:

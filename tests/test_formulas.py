@@ -160,10 +160,10 @@ def test_bounds_are_mapped_to_one():
 
 
 def test_bounds_that_nobody_reaches_are_dropped():
-    """Of 35 and 1e8, more than 100 times wider than the data. 20 and 2 stay."""
-    data = [[0.25, 300.0, 0.25, 0.5], [-0.25, -300, -0.25, -0.5]]
-    scaling = fitted([-35, -1e8, -20, -2], [35, 1e8, 20, 2], data)
-    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 10, 1])), torch.tensor([2.0, 1.0, 0.5, 0.5]))
+    """Of 35 and 1e8, more than 130 times wider than the data. 30 stays, and a byte's that was constant."""
+    data = [[0.25, 300.0, 0.25, 0.0], [-0.25, -300, -0.25, 0]]
+    scaling = fitted([-35, -1e8, -30, 0], [35, 1e8, 30, 255], data)
+    torch.testing.assert_close(scaling(torch.tensor([2.0, 600, 15, 255])), torch.tensor([2.0, 1.0, 0.5, 1.0]))
 
 
 def test_numbers_without_bounds_are_scaled_only_beyond_ten():

@@ -135,13 +135,14 @@ def test_what_may_change(script, reference):
     for changes, said in (
         ({"num_iterations": 299}, "--num-iterations 299 is less than the run's 300"),
         ({"gamma": 0.5}, "--gamma 0.5 differs from the 0.99 of the run .* leave it out"),
+        ({"run_dir": "elsewhere"}, "--run-dir elsewhere differs from"),
     ):
         with pytest.raises(common.InputError, match=said):
             common.continued(module.Config(**{"num_iterations": 300} | changes), reference, script)
-    changed = module.Config(num_iterations=310, num_threads=2, device="cpu")
+    changed = module.Config(num_iterations=310, num_threads=2, device="cpu", run_dir=reference)
     config, state = common.continued(changed, reference, script)
     saved = module.Config(**state["config"])
-    assert config == dataclasses.replace(saved, num_iterations=310, num_threads=2, video=True)
+    assert config == dataclasses.replace(saved, num_iterations=310, num_threads=2, video=True, run_dir=reference)
     assert config.batch_size == 24
 
 
