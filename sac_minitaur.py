@@ -611,7 +611,7 @@ class Simulator:
 
 
 class MinitaurBulletEnv(gym.Env):
-    """Ghost Robotics' Minitaur on a plane, equal to the last bit to pybullet's `MinitaurBulletEnv-v0` of the old gym.
+    """Ghost Robotics' Minitaur on a plane, pybullet's `MinitaurBulletEnv-v0` to the last bit, under numpy 2.
 
     Action (8,): the swings of the legs front left, back left, front right, back right, then their extensions, in
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
