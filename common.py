@@ -520,6 +520,11 @@ def plot_learning_curve(path, tables, title, reward_threshold):
 # A training run
 
 
+def replay_tensors(buffer):
+    """The tensors of a script's `ReplayBuffer`, by name: each has a row, (capacity, …), for a transition."""
+    return {name: value for name, value in vars(buffer).items() if torch.is_tensor(value)}
+
+
 def require_finite(module, step):
     """Raises FloatingPointError, naming the first parameter or buffer that has a number which is not finite."""
     for name, tensor in module.state_dict().items():
@@ -533,13 +538,12 @@ def stop_signals():
     requested = threading.Event()
 
     def request_stop(number, _):
-        if requested.is_set():
-            if number == signal.SIGINT:
-                raise KeyboardInterrupt
-            return
-        requested.set()
-        # Not print: the signal may have interrupted one.
-        os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
+        if not requested.is_set():
+            requested.set()
+            # Not print: the signal may have interrupted one.
+            os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
+        elif number == signal.SIGINT:
+            raise KeyboardInterrupt
 
     numbers = (signal.SIGINT, signal.SIGTERM)
     handlers = [signal.signal(number, request_stop) for number in numbers]
@@ -568,12 +572,11 @@ class Run:
 
     SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # by `save`, for `_restore`
 
-    def __init__(self, script, config, evaluate, resume=None, processes=(0, 1)):
+    def __init__(self, script, config, evaluate, processes=(0, 1)):
         """Raises InputError for a config that cannot be used. Nothing is written yet."""
         self.script = script
         self.config = config
         self.evaluate_episode = evaluate
-        self.resume = resume
         self.rank, self.world_size = processes
         self.device = select_device(config.device)
         if config.batch_size % self.world_size:
@@ -615,7 +618,7 @@ class Run:
         self.progress = tqdm(total=self.config.num_iterations, initial=step, unit="step", disable=hidden)
         self.stack.callback(self.progress.close)
         if self.rank == 0:
-            self._begin_files()
+            self._begin_files(new=checkpoint is None)
             limit = self.task.max_episode_steps
             say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps, on {self.device}")
             say(f"run directory {self.path}")
@@ -632,10 +635,12 @@ class Run:
             self.agent.load_state_dict(saved["agent"])
             for optimizer, state in zip(self.agent.optimizers, saved["optimizers"], strict=True):
                 optimizer.load_state_dict(state)
-            for name, value in vars(self.buffer).items():
-                if torch.is_tensor(value):
-                    value[: own["size"]] = own["replay"][name]
-        except (KeyError, RuntimeError, ValueError) as error:
+            replay = replay_tensors(self.buffer)
+            if replay.keys() != own["replay"].keys():
+                raise ValueError(f"the replay has {', '.join(replay)}, the checkpoint {', '.join(own['replay'])}")
+            for name, rows in own["replay"].items():
+                replay[name][: len(rows)] = rows
+        except (RuntimeError, ValueError) as error:
             what = f"does not fit this script's networks, optimizers and replay ({one_line(error)})"
             raise InputError(f"{self.path} {what}: continue it with the script that saved it") from None
         self.buffer.size = own["size"]
@@ -648,8 +653,8 @@ class Run:
         self.started = time.perf_counter() - saved["seconds"]
         return saved["step"]
 
-    def _begin_files(self):
-        if self.resume is None:
+    def _begin_files(self, new):
+        if new:
             try:
                 self.path.mkdir(parents=True)
             except (OSError, ValueError) as error:
@@ -671,9 +676,8 @@ class Run:
         """Saves a checkpoint, and the policy for --evaluate. Raises FloatingPointError for bad weights."""
         buffer = self.buffer
         own = {"replay": {}, "size": buffer.size, "position": buffer.position, "random": torch.get_rng_state()}
-        for name, value in vars(buffer).items():
-            if torch.is_tensor(value):  # (capacity, …)
-                own["replay"][name] = value[: buffer.size].to("cpu", copy=True)  # a slice would save all rows
+        for name, rows in replay_tensors(buffer).items():
+            own["replay"][name] = rows[: buffer.size].to("cpu", copy=True)  # a slice would save all rows
         if self.device.type == "cuda":
             own["cuda_random"] = torch.cuda.get_rng_state(self.device)
         processes = [own] * self.world_size if self.rank == 0 else None

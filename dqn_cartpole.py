@@ -322,7 +322,7 @@ def train(config, resume=None):
     Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "dqn_cartpole")
-    with common.Run("dqn_cartpole", config, evaluate, resume) as run:  # its evaluations call `evaluate`
+    with common.Run("dqn_cartpole", config, evaluate) as run:  # its evaluations call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # task: a gymnasium spec
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
         env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later

@@ -517,7 +517,7 @@ def train(config, resume=None):
     """
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
     rank, world_size = common.join_processes()  # this process's number and their count, of torchrun; else 0 and 1
-    with common.Run("sac_minitaur", config, evaluate, resume, (rank, world_size)) as run:  # it calls `evaluate`
+    with common.Run("sac_minitaur", config, evaluate, (rank, world_size)) as run:  # it calls `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
         run.stack.callback(envs.close, terminate=True)  # an ExitStack: closes them after an error, too

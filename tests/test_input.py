@@ -193,15 +193,17 @@ def test_damaged_or_foreign_file(script, copy, monkeypatch, name):
 
 
 def test_a_changed_script(script, copy):
-    """Its network is larger, it has one more optimizer or one of another kind, or a tensor more of the replay."""
+    """Its network is larger, it has one more optimizer or one of another kind, or other tensors in its replay."""
     state = torch.load(copy / "checkpoint.pt")
     larger = {name: torch.stack((value, value)) for name, value in state["agent"].items()}
     first, *others = state["optimizers"]
     grouped = first | {"param_groups": 2 * first["param_groups"]}
     own = state["processes"][0]
+    more_replay = own | {"replay": own["replay"] | {"ages": torch.zeros(250)}}
     less_replay = own | {"replay": {name: rows for name, rows in own["replay"].items() if name != "rewards"}}
     for values in (
-        {"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]}, {"processes": [less_replay]}
+        {"agent": larger}, {"optimizers": others}, {"optimizers": [grouped, *others]},
+        {"processes": [more_replay]}, {"processes": [less_replay]},
     ):  # fmt: skip
         torch.save(state | values, copy / "checkpoint.pt")
         assert f"{copy} does not fit" in refused(script, "--resume", copy)

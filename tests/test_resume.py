@@ -8,12 +8,14 @@ import os
 import signal
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import common
+import dqn_cartpole
 import sac_minitaur
 from runs import AGENTS, MODULES, ROOT, Process, assert_same_run, before_call, checkpoint, die, flags
 from runs import interrupt, read_command_line, read_csv, rows, run_python, session, wait_until
@@ -108,7 +110,8 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
         ("raised", [*resume, "--num-iterations", 300], partial(update, die), killed),
         ("checkpoint at 200", resume, die_in_the_second_checkpoint, killed),
         ("evaluation at 300", resume, partial(second_evaluation, interrupt), 130),
-        ("film", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, interrupt), 130),
+        ("film", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, die), killed),
+        ("film stopped", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, interrupt), 130),
     )
     for name, arguments, hook, status in stages:
         run = Process(script, arguments, tmp_path / name, hook)
@@ -144,6 +147,17 @@ def test_what_may_change(script, reference):
     saved = module.Config(**state["config"])
     assert config == dataclasses.replace(saved, num_iterations=310, num_threads=2, video=True, run_dir=reference)
     assert config.batch_size == 24
+
+
+def test_a_csv_keeps_its_columns(tmp_path):
+    """A metric that appears later goes to TensorBoard alone. One that is missing later is nan."""
+    run = common.Run("dqn_cartpole", dqn_cartpole.Config(run_dir=tmp_path, device="cpu"), None)
+    shown = []
+    run.board = SimpleNamespace(add_scalar=lambda *scalar: shown.append(scalar))
+    run._add_row("train", 20, {"loss": 1.5})
+    run._add_row("train", 40, {"one": 1.0})
+    assert rows(tmp_path / "train.csv") == [["step", "env_steps", "loss"], ["20", "0", "1.5"], ["40", "0", "nan"]]
+    assert ("train/loss", 1.5, 20) in shown and ("train/one", 1.0, 40) in shown
 
 
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
