@@ -1,7 +1,6 @@
 """What both scripts need besides their algorithms: the command line, files, workers, and a run's tables and films.
 
-No loss and no replay buffer is here, and no training environment is stepped here. One class belongs to the learning
-itself: `ObservationScaling`, a part of both policies.
+One class belongs to the learning itself: `ObservationScaling`, a part of both policies.
 """
 
 import argparse
@@ -37,7 +36,7 @@ from pydantic import ConfigDict, Field
 from pydantic_core import to_json, to_jsonable_python
 from tqdm import tqdm
 
-FILE_FORMAT = 4  # of checkpoints and policies
+FILE_FORMAT = 5  # of checkpoints and policies
 MAY_CHANGE_ON_RESUME = ("num_iterations", "device", "num_threads", "cuda_graph", "video")
 
 # The types of the scripts' options
@@ -100,8 +99,9 @@ def read_command_line(script, config_class, tutorial, description):
     first.add_argument("--resume", type=Path)
     first.add_argument("--evaluate", type=Path)
     given, _ = first.parse_known_args()
-    if given.resume is not None and given.evaluate is not None:
-        raise InputError("--resume continues training, --evaluate plays a saved policy: give one of them")
+    chosen = [f"--{name}" for name, value in vars(given).items() if value]
+    if len(chosen) > 1:
+        raise InputError(f"{' and '.join(chosen)} say different things: give one of them")
     if given.resume is not None:
         _, default = read_file(given.resume / "checkpoint.pt", "checkpoint", script, config_class)
     elif given.evaluate is not None:
@@ -125,7 +125,7 @@ def continued(config, resume, script):
     """The config to train with, and the checkpoint of the run in the directory `resume`; for a new run it is None.
 
     A run that continues takes `MAY_CHANGE_ON_RESUME` from `config`, and all else from its checkpoint. Raises InputError
-    for another value in `config`, unless it is the default.
+    for other values in `config`, except defaults.
     """
     if resume is None:
         return config, None
@@ -194,12 +194,11 @@ def draw_without_display():
         os.environ.setdefault("MUJOCO_GL", "egl")
 
 
-def find_task(config, action_space, training=True):
+def find_task(config, needed, training=True):
     """The gymnasium spec of --env-id, with a time limit, and its observation and action spaces.
 
-    Raises InputError when the task is unknown, or has not the kind of `action_space` that the algorithm needs,
-    `gym.spaces.Discrete` or `Box`; for `training` also when no episode can end between two checkpoints. An error of the
-    task's own code is raised as it is.
+    Raises InputError when the task is unknown, or its action space is not what is `needed`, `gym.spaces.Discrete` or
+    `Box`; for `training` also when no episode can reach its time limit between two checkpoints.
     """
     draw_without_display()
     name = f"--env-id {config.env_id}"
@@ -209,34 +208,33 @@ def find_task(config, action_space, training=True):
         hint = "a package's task is written package:Task-v0, as highway_env:highway-v0"
         raise InputError(f"{name} cannot be made: {one_line(error)} ({hint})") from None
     with env:
-        require_spaces(name, env.observation_space, env.action_space, action_space)
+        require_spaces(name, env.observation_space, env.action_space, needed)
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
-                say(f"warning: each evaluation's {wrapper} starts anew: it cannot know the statistics of training")
-        task = copy.copy(gym.registry[env.unwrapped.spec.id])  # env.spec also lists the task's own wrappers
-        task.max_episode_steps = env.spec.max_episode_steps  # the flag's, if there is one
-    if task.max_episode_steps is None:
-        task.max_episode_steps = 10_000  # for evaluations; in training we trust that the task ends its episodes
-    elif training and task.max_episode_steps > config.checkpoint_interval * config.collect_steps_per_iteration:
-        what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {task.max_episode_steps} steps"
+                say(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
+        limit = env.spec.max_episode_steps  # the flag's, if there is one
+        task = gym.spec(env.unwrapped.spec.id)  # env.spec lists the task's own wrappers, which gym.make may refuse
+    if training and limit and limit > config.checkpoint_interval * config.collect_steps_per_iteration:
+        what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {limit} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
+    task = dataclasses.replace(task, max_episode_steps=limit or 10_000)
     return task, env.observation_space, env.action_space
 
 
-def require_spaces(name, observations, actions, action_space):
+def require_spaces(name, observations, actions, needed):
     """Raises InputError unless a task's spaces are a Box, and a Discrete from 0 for DQN or a Box of floats for SAC."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape:
         hint = "gymnasium.wrappers.FlattenObservation makes one of most others"
         raise InputError(f"{name} has the observation space {observations}: a Box of some dimension is needed ({hint})")
-    fits = isinstance(actions, action_space)
-    if fits and action_space is gym.spaces.Discrete:
-        fits = actions.start == 0
-    if fits and action_space is gym.spaces.Box:
-        fits = actions.shape and np.issubdtype(actions.dtype, np.floating) and actions.is_bounded()
+    if needed is gym.spaces.Discrete:
+        fits = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
+    else:
+        floats = isinstance(actions, gym.spaces.Box) and np.issubdtype(actions.dtype, np.floating)
+        fits = floats and actions.shape and actions.is_bounded()
     if not fits:
-        needed = "dqn_cartpole.py needs a Discrete from 0, sac_minitaur.py a Box of floats with bounds"
+        what = "dqn_cartpole.py needs a Discrete from 0, sac_minitaur.py a Box of floats with bounds"
         hint = "gymnasium.wrappers.TransformAction can map others"
-        raise InputError(f"{name} has the action space {actions}: {needed} ({hint})")
+        raise InputError(f"{name} has the action space {actions}: {what} ({hint})")
 
 
 class ObservationScaling(torch.nn.Module):
@@ -259,15 +257,14 @@ class ObservationScaling(torch.nn.Module):
         """Corrects the scales by observations (N, O) of random actions.
 
         Bounds over 130 times wider than the data are dropped: scaled by them, all observations would come near one
-        number. (CartPole's are up to 84 times wider. A byte that was constant, half its range 127.5, keeps its bounds.)
-        A number without bounds is centred and scaled by its data if these lie beyond ±10. They then fill half of
-        [-1, 1], since what a better policy sees lies farther out.
+        number. A number without bounds is centred and scaled by its data if these lie beyond ±10. They then fill half
+        of [-1, 1], since what a better policy sees lies farther out.
         """
         low = observations.amin(0)
         high = observations.amax(0)
         average([low, high])  # in place: the processes' mean extremes, so that all have the same scales
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        self.bounded &= self.half_range <= 130 * spread
+        self.bounded &= self.half_range <= 130 * spread  # the ratio is up to 84 in CartPole, 127.5 for a constant byte
         self.center[~self.bounded] = 0.0
         self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
@@ -284,15 +281,12 @@ def derive_seed(seed, *key):
 
 
 def evaluation_seeds(config):
-    """The seeds of every evaluation's episodes. Training has none of them: its environments' numbers are small."""
+    """The seeds of every evaluation's episodes. Training has none of them: the first numbers of its keys are small."""
     return [derive_seed(config.seed, 2**32 - 1, i) for i in range(config.num_eval_episodes)]
 
 
 def select_device(name):
-    """The `torch.device` for --device: `auto` is CUDA or else the CPU. Each of torchrun's processes has its own GPU.
-
-    Raises InputError for a device that is not there.
-    """
+    """The `torch.device` for --device: each of torchrun's processes has its own GPU. Raises InputError if not there."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda":
@@ -332,8 +326,7 @@ def average(tensors):
 def start_method(env_id):
     """How to start workers: "fork" is the quickest, but a forked process lacks the main process's threads and CUDA.
 
-    A package (package:Task-v0) or JAX may have started threads when it was imported, and would wait for them for ever.
-    So these tasks' workers start clean.
+    A package (package:Task-v0) or JAX may have threads, and would wait for them for ever. So its workers start clean.
     """
     if sys.platform != "linux":
         return "spawn"
@@ -345,16 +338,12 @@ def start_method(env_id):
 
 @contextlib.contextmanager
 def worker_pool(size, method):
-    """A pool of `size` processes.
-
-    At the end it kills all processes that began since: its own, and SAC's environments if a run failed before it closed
-    them.
-    """
+    """A pool of `size` processes. At the end it kills all that began since, also SAC's environments after an error."""
     children_before = set(multiprocessing.active_children())
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # new processes inherit it, until `prepare_worker`
     for _ in range(size):
-        pool.submit(int)  # starts a process
+        pool.submit(int)  # so that all processes start now
     signal.signal(signal.SIGINT, handler)
     try:
         yield pool
@@ -370,7 +359,7 @@ def prepare_worker():
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     draw_without_display()
     if hasattr(os, "nice"):  # not on Windows
-        os.nice(5)  # the main process goes first: its update is the longest work between two vector steps
+        os.nice(5)  # the main process goes first. Its update is what SAC's environments, workers too, wait for
     torch.set_num_threads(1)
     np.random.seed()  # a task may use these generators: all workers begin with copies of the same
     torch.seed()
@@ -428,7 +417,7 @@ def evaluate_file(path, script, config, policy, task, evaluate):
     if config.video:
         video = path.with_suffix(".mp4")
         with or_warn("film"):
-            film(video, task, seeds[0], [(policy, None, None)])
+            film(video, task, seeds[0], [(policy, "")])
             say(f"filmed one episode: {video}")
 
 
@@ -442,22 +431,17 @@ def or_warn(what):
 
 
 def film(path, task, seed, clips, seconds=math.inf):
-    """Films the first `seconds` of an episode for each of `clips`, in real time, at most 50 frames a second.
-
-    A clip is a policy (None: random actions), weights to load into it or None, and a caption or None.
-    """
+    """Films the first `seconds` of an episode, in real time, for each of `clips`: a policy or None, and a caption."""
     import imageio  # here: it takes a moment
 
     with gym.make(task, render_mode="rgb_array") as env:
         rate = env.metadata.get("render_fps") or 30
-        skip = math.ceil(rate / 50)
+        skip = math.ceil(rate / 50)  # at most 50 frames a second
         options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
 
         def write(file):
             with imageio.get_writer(file.name, **options) as video:  # ffmpeg opens it by its name
-                for policy, weights, caption in clips:
-                    if weights is not None:
-                        policy.load_state_dict(weights)
+                for policy, caption in clips:
                     for frame in frames(env, policy, seed, skip, seconds * rate):
                         video.append_data(with_caption(frame, caption))
 
@@ -465,7 +449,7 @@ def film(path, task, seed, clips, seconds=math.inf):
 
 
 def frames(env, policy, seed, skip, max_steps):
-    """The pictures of one episode: one of every `skip` steps, and the last."""
+    """The pictures of one episode: one of every `skip` steps, and the last. `policy` None: random actions."""
     observation, _ = env.reset(seed=seed)
     env.action_space.seed(seed)
     step = 0
@@ -488,7 +472,7 @@ def with_caption(frame, caption):
         found = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
         raise ValueError(f"the task's render returned {found}; needed: an array of uint8, (height, width, 3)")
     image = Image.fromarray(frame)
-    ImageDraw.Draw(image).text((8, 8), caption or "", "black", font_size=20, stroke_width=2, stroke_fill="white")
+    ImageDraw.Draw(image).text((8, 8), caption, "black", font_size=20, stroke_width=2, stroke_fill="white")
     return np.asarray(image)
 
 
@@ -525,10 +509,10 @@ def replay_tensors(buffer):
     return {name: value for name, value in vars(buffer).items() if torch.is_tensor(value)}
 
 
-def require_finite(module, step):
-    """Raises FloatingPointError, naming the first parameter or buffer that has a number which is not finite."""
-    for name, tensor in module.state_dict().items():
-        if not tensor.isfinite().all():
+def require_finite(values, step):
+    """Raises FloatingPointError, naming the first of `values`, a dict of tensors or numbers, that is not finite."""
+    for name, value in values.items():
+        if not torch.as_tensor(value).isfinite().all():
             raise FloatingPointError(f"{name} is not finite at step {step}; the last good checkpoint is kept")
 
 
@@ -557,7 +541,7 @@ def stop_signals():
 def write_csv(path, rows):
     """Writes a table, a list of dicts. It has the columns of its first row: later ones go to TensorBoard alone."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], restval=math.nan, extrasaction="ignore", lineterminator="\n")
+    writer = csv.DictWriter(text, rows[0], extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_atomically(path, lambda file: file.write(text.getvalue().encode()))
@@ -589,7 +573,7 @@ class Run:
         self.finished = []  # returns and lengths of the last ten training episodes that ended
         self.metrics = {}  # the latest of each: an update may not return all
         self.best = (-math.inf, None)  # return and weights of the best policy
-        self.snapshots = []  # captions and weights of five policies, for the film of how it learned
+        self.snapshots = []  # step, return and weights of some policies, for the film of how it learned
         self.tables = {"train": [], "eval": [], "random": []}
         self.started = time.perf_counter()
         self.stack = contextlib.ExitStack()  # what to end and to undo at the end, the last first
@@ -664,6 +648,8 @@ class Run:
         write_atomically(self.path / "config.json", lambda file: file.write(text))
         for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
             path.unlink()  # left before a resume: the events are written anew below, and a kill leaves .tmp files
+        if self.best[1] is not None:  # after a resume: the file may have weights of after the checkpoint
+            self._write("best_policy.pt", "policy", {"weights": self.best[1]})
         from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
 
         self.board = SummaryWriter(self.path)
@@ -685,7 +671,7 @@ class Run:
             dist.gather_object(own, processes)  # fills process 0's list
         if self.rank:
             return
-        require_finite(self.agent, step)
+        require_finite(self.agent.state_dict(), step)
         state = {name: getattr(self, name) for name in self.SAVED}
         state |= {"step": step, "seconds": time.perf_counter() - self.started, "processes": processes}
         state |= {"agent": self.agent.state_dict(), "optimizers": [each.state_dict() for each in self.agent.optimizers]}
@@ -696,8 +682,12 @@ class Run:
         head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": self.plain_config}
         write_atomically(self.path / name, lambda file: torch.save(head | state, file))
 
-    def _cpu_policy(self):
-        return copy.deepcopy(self.agent.policy).cpu().eval()
+    def _cpu_policy(self, weights=None):
+        """A copy of the policy for the CPU, with other weights if they are given."""
+        policy = copy.deepcopy(self.agent.policy).cpu().eval()
+        if weights is not None:
+            policy.load_state_dict(weights)
+        return policy
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
@@ -712,10 +702,8 @@ class Run:
         self.metrics = self.metrics | metrics
         if self.rank or step % self.config.log_interval:
             return
+        require_finite(self.metrics, step)
         values = {name: float(value) for name, value in self.metrics.items()}
-        for name, value in values.items():
-            if not math.isfinite(value):
-                raise FloatingPointError(f"{name} is {value} at step {step}; the last good checkpoint is kept")
         last_step, then = self.last_logged
         self.last_logged = (step, time.perf_counter())
         speed = (step - last_step) / (time.perf_counter() - then)
@@ -748,7 +736,7 @@ class Run:
         if self.rank or (rows and rows[-1]["step"] == step):
             return
         if policy:
-            policy = self._cpu_policy()
+            policy = copy.deepcopy(policy).cpu().eval()
         call = (evaluate_in_worker, self.evaluate_episode, pickle.dumps(policy), self.pickled_task)
         episodes = [self.pool.submit(*call, seed) for seed in evaluation_seeds(self.config)]
         while futures.wait(episodes, timeout=0.1).not_done and not self.stop_request.is_set():
@@ -760,13 +748,14 @@ class Run:
         say(f"step = {step}: {text}" if policy else f"random policy: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
-            require_finite(policy, step)
+            require_finite(policy.state_dict(), step)
             self._keep(step, row["average_return"], policy.state_dict())
 
     def _keep(self, step, average_return, weights):
-        """Keeps the best weights so far, and for a film those at 0, 1/16, 1/4, 9/16 and all of the updates."""
-        if step >= (len(self.snapshots) / 4) ** 2 * self.config.num_iterations:  # most is learned at the beginning
-            self.snapshots.append((f"{step} updates: return {average_return:.1f}", weights))
+        """Keeps the best weights so far, and some for a film: the first, each at 4 times the step before, the last."""
+        due = 4 * self.snapshots[-1][0] if self.snapshots else 0  # most is learned at the beginning
+        if step >= due or step == self.config.num_iterations:
+            self.snapshots.append((step, average_return, weights))
         if average_return > self.best[0]:
             self.best = (average_return, weights)
             self._write("best_policy.pt", "policy", {"weights": weights})
@@ -786,7 +775,7 @@ class Run:
 
     def finish(self, step, observation_shape):
         """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
-        self.save(step)  # first: a longer run, which --resume may make of it, would not play this evaluation
+        self.save(step)  # before the evaluation: a longer run, which --resume may make of this one, lacks it
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
         if self.rank:
@@ -797,10 +786,8 @@ class Run:
         if self.config.video:
             self._film()
         with or_warn("exported policies"):
-            policy = self._cpu_policy()
-            export_policy(self.path / "policy.pt2", policy, observation_shape)
-            policy.load_state_dict(self.best[1])
-            export_policy(self.path / "best_policy.pt2", policy, observation_shape)
+            export_policy(self.path / "policy.pt2", self._cpu_policy(), observation_shape)
+            export_policy(self.path / "best_policy.pt2", self._cpu_policy(self.best[1]), observation_shape)
         files = sorted(path.name for path in self.path.iterdir())
         say(f"finished; {self.path} holds {', '.join(files)}")
 
@@ -810,10 +797,11 @@ class Run:
 
     def _film(self):
         say("filming the trained agent, a random one, and how it learned ...")
-        policy = self._cpu_policy()
         seed = evaluation_seeds(self.config)[0]
-        learning = [(policy, weights, caption) for caption, weights in self.snapshots]
+        learning = []
+        for step, average_return, weights in self.snapshots:
+            learning.append((self._cpu_policy(weights), f"{step} updates: return {average_return:.1f}"))
         with or_warn("film"):
-            film(self.path / "trained_agent.mp4", self.task, seed, [(policy, None, None)])
-            film(self.path / "random_agent.mp4", self.task, seed, [(None, None, None)])
+            film(self.path / "trained_agent.mp4", self.task, seed, [(self._cpu_policy(), "")])
+            film(self.path / "random_agent.mp4", self.task, seed, [(None, "")])
             film(self.path / "learning.mp4", self.task, seed, learning, seconds=4)

@@ -9,15 +9,16 @@
 The Q-network estimates Q(s, a): the sum of the rewards after action a in state s, with the best actions from then on.
 A reward one step later counts γ times as much. Each update moves Q(s, a) towards a target:
 
-    y = r + γ max Q̄(s', ·), or y = r where the task ended
+    y = r + γ max Q̄(s', ·), or y = r where the pole fell
 
 Here r is the reward, s' is the next state, and the maximum is over all actions there. Q̄ is the target network, a slow
-copy of the Q-network. Without it each update would move its own target, too, and Q could diverge. The policy takes the
-action of the largest Q. While it collects data, some actions are random: so it explores. A replay buffer keeps the
-transitions (s, a, r, s', ended). Each update learns from a few, drawn at random: neighbours in time are too similar.
+copy of the Q-network. Without it each update would move its own target, too, and Q could diverge. The greedy policy
+takes the action of the largest Q. While it collects data, some actions are random: so it explores. A replay buffer
+keeps the transitions (s, a, r, s', fell). Each update learns from a few, drawn at random: neighbours are too similar.
 
-This script reimplements the TF-Agents tutorial "Train a Deep Q Network" (2021, 2023): Mnih et al. 2015, "Human-level
-control through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks what is "ours".
+This script reimplements the TF-Agents tutorial "Train a Deep Q Network" (editions of 2021 and 2023), after Mnih et al.
+2015, "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks
+what is "ours".
 """
 
 import copy
@@ -53,14 +54,14 @@ class Config:
 
     learning_rate: NonNegativeFloat = 1e-3  # Adam's, at the start
     learning_rate_decay: PositiveInt | None = 3_000  # ours (theirs: None): after this many updates the rate is half
-    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε. Keras has this value, but adds it before the bias correction
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε, Keras's value
     epsilon: common.Fraction = 0.1  # probability of a random action while collecting (TF-Agents' default)
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     time_limit_terminates: bool = False  # ours (theirs: yes, in 2023): a time limit counts as an end of the task
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, so no slow copy): Q̄ ← Q̄ + τ (Q − Q̄), in the weights
-    value_unit: bool = True  # ours (theirs: no): Q = offset + scale × the network's output: see `fit_scaling`
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): lower targets by this × (max Q̄(s, ·) − Q̄(s, a))
-    observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
+    value_unit: bool = True  # ours (theirs: no): learn Q in units of about 1 / (1 − γ): see `fit_scaling`
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): widens the gap to worse actions: see `update`
+    observation_scaling: bool = True  # ours (theirs: no): bring observations near [-1, 1]: `common.ObservationScaling`
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
 
     seed: common.Seed = 0  # source of all randomness
@@ -95,10 +96,10 @@ TUTORIAL = {
 
 
 class QNetwork(nn.Module):
-    """One output for each action. Q is offset + scale × output: see `DQNAgent.q_values`.
+    """One output for each action. Q is offset + scale × output: see `DQNAgent.fit_scaling`.
 
-    It starts as the tutorial's. ReLU layers: weights of variance 2 / inputs, from a normal distribution cut at two
-    standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
+    The first weights are as the tutorial's. ReLU layers: weights of variance 2 / inputs, from a normal distribution cut
+    at two standard deviations, and zero biases. Last layer: weights from U(−0.03, 0.03), biases −0.2.
     """
 
     def __init__(self, observation_size, num_actions, hidden_layers):
@@ -143,14 +144,14 @@ class Policy(nn.Module):
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions, on the training device, in float32.
+    """The last `capacity` transitions, on the training device. Actions are numbered from 0, all else is float32.
 
-    `terminated` is 1 only where the task itself ended. After a time limit it is 0: more reward would have followed.
+    `terminated` is 1 only where the task itself ended. After a time limit (`truncated`) it is 0: rewards would follow.
     """
 
     def __init__(self, capacity, observation_size, device):
         self.observations = torch.empty((capacity, observation_size), device=device)
-        self.actions = torch.empty((capacity,), device=device)  # whole numbers
+        self.actions = torch.empty((capacity,), dtype=torch.int64, device=device)
         self.rewards = torch.empty((capacity,), device=device)
         self.terminated = torch.empty((capacity,), device=device)
         self.next_observations = torch.empty((capacity, observation_size), device=device)
@@ -162,7 +163,7 @@ class ReplayBuffer:
         """Stores one transition: numpy (O,), numbers, numpy (O,). A full buffer drops its oldest."""
         i = self.position
         self.observations[i] = torch.from_numpy(observation)
-        self.actions[i] = float(action)
+        self.actions[i] = action
         self.rewards[i] = float(reward)
         self.terminated[i] = float(terminated)
         self.next_observations[i] = torch.from_numpy(next_observation)
@@ -174,7 +175,7 @@ class ReplayBuffer:
         i = torch.randint(self.size, (batch_size,), generator=generator).to(self.rewards.device)
         return (
             self.observations[i],
-            self.actions[i].long(),
+            self.actions[i],
             self.rewards[i],
             self.terminated[i],
             self.next_observations[i],
@@ -182,7 +183,8 @@ class ReplayBuffer:
 
 
 def td_targets(rewards, terminated, next_q, gamma):
-    """r + γ (1 − terminated) max Q̄(s', ·): (B,), for next_q (B, A) and the rest (B,). Algorithm 1 of Mnih et al."""
+    """The targets y = r + γ (1 − terminated) max Q̄(s', ·): (B,), for next_q (B, A), the rest (B,). TD is for temporal
+    difference, between Q(s, a) and y. Algorithm 1 of Mnih et al."""
     return rewards + gamma * (1 - terminated) * next_q.amax(1)
 
 
@@ -199,7 +201,7 @@ class DQNAgent(nn.Module):
         self.config = config
         self.device = device
         self.num_actions = int(action_space.n)
-        self.generator = torch.Generator()  # draws actions and batches. A task may use PyTorch's global generator
+        self.generator = torch.Generator()  # of actions and batches. A task may use PyTorch's global one
         self.generator.manual_seed(config.seed)
         self.policy = Policy(config, observation_space, action_space)
         self.scaling = self.policy.scaling
@@ -211,7 +213,7 @@ class DQNAgent(nn.Module):
         self.optimizer = torch.optim.Adam(
             self.q_network.parameters(), config.learning_rate, eps=config.adam_epsilon, fused=True
         )  # fused: one operation for all parameters
-        self.optimizers = [self.optimizer]  # what a checkpoint saves; add a scheduler here
+        self.optimizers = [self.optimizer]  # a checkpoint saves them
 
     def get_extra_state(self):
         """The generator's state, which `state_dict` adds to the weights: so a checkpoint has it."""
@@ -224,7 +226,7 @@ class DQNAgent(nn.Module):
     def fit_scaling(self, observations, rewards):
         """Fits the scales to observations (N, O) and rewards (N,) of random actions.
 
-        So the network learns numbers near 1, not near 100. Output 0 then stands for the Q of an episode that never ends
+        So the network learns numbers of size 1, not 100. Output 0 then stands for the Q of an episode that never ends
         and earns the mean reward: mean reward / (1 − γ). CartPole's rewards are 1: with γ = 0.99, Q = 100 + 100 ×
         output, and output −1 stands for no more reward. If all rewards were 0, Q stays the output.
         """
@@ -255,24 +257,25 @@ class DQNAgent(nn.Module):
         """Update number `step`, from 0. Returns the scalars to log, as tensors on the device.
 
         Plain DQN: Q(s, a) takes a gradient step towards y = r + γ (1 − terminated) max Q̄(s', ·). Then the weights θ̄
-        of the target network follow the Q-network's: θ̄ ← θ̄ + τ (θ − θ̄). What we add is in the blocks marked "ours".
+        of the target network follow the Q-network's: θ̄ ← θ̄ + τ (θ − θ̄). What we add is in the lines marked "ours", and
+        in `q_values`, for --value-unit.
         """
         config = self.config
         s, a, rewards, terminated, next_s = batch  # (B, O), (B,), (B,), (B,), (B, O)
-        if config.observation_scaling:  # ours
-            s = self.scaling(s)
-            next_s = self.scaling(next_s)
+        s = self.scaling(s)  # ours. Without --observation-scaling it changes nothing
+        next_s = self.scaling(next_s)
 
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # (B,)
-            if config.advantage_learning:  # ours: a wider gap to worse actions, so errors seldom change which is best
+            if config.advantage_learning:  # ours: lowers the targets of worse actions: errors seldom let one seem best
+                # The best action's gap is 0, so max Q keeps its meaning.
                 target_q = self.q_values(self.target_network, s)  # Q̄(s, ·): (B, A)
                 y = y - config.advantage_learning * gap_to_best(target_q, a)
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
-        loss = F.mse_loss(q, y)  # mean (Q(s, a) − y)²
+        loss = F.mse_loss(q, y)
 
-        if config.learning_rate_decay:  # ours: half the rate after `learning_rate_decay` updates
+        if config.learning_rate_decay:  # ours: a half after `learning_rate_decay` updates, a fifth after twice as many
             rate = config.learning_rate / (1 + (step / config.learning_rate_decay) ** 2)
             self.optimizer.param_groups[0]["lr"] = rate
         self.optimizer.zero_grad()
@@ -302,7 +305,7 @@ def evaluate(policy, env, seed):
 
 
 def collect_step(env, observation, action, buffer, run):
-    """Takes one step, stores the transition, tells `run`. Returns the observation to act on next: (O,)."""
+    """Takes one step, stores the transition, tells `run`, a `common.Run`. Returns what to act on next: (O,)."""
     next_observation, reward, terminated, truncated, info = env.step(action)
     if run.config.time_limit_terminates:  # theirs
         terminated = terminated or truncated
@@ -331,29 +334,29 @@ def train(config, resume=None):
         buffer = ReplayBuffer(config.replay_buffer_capacity, math.prod(observation_space.shape), run.device)
         start = run.begin(task, agent, buffer, checkpoint)  # restores a checkpoint. start: the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:  # a resumed run has done this before
+        if run.env_steps < config.initial_collect_steps:  # most resumed runs are past this
             observation, _ = env.reset(seed=common.derive_seed(config.seed))
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
                 observation = collect_step(env, observation, agent.random_action(), buffer, run)
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
-        for update in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode, so a resumed run begins a new episode at its checkpoint. One
-            # left alone does so, too, at every checkpoint: both are the same to the bit. The cut is no termination: the
-            # targets of the transitions before it keep Q̄(s', ·).
-            if update == start or update % config.checkpoint_interval == 0:
-                run.save(update)
-                observation, _ = env.reset(seed=common.derive_seed(config.seed, update))
-            if update % config.eval_interval == 0:
-                run.evaluate(update, agent.policy)
-            run.stop_if_requested(update)
+        for step in range(start, config.num_iterations):
+            # gymnasium cannot save a task in mid-episode, so a resumed run begins a new episode at its checkpoint.
+            # Every run does so at every checkpoint: then one that was killed and resumed equals one left alone. The cut
+            # is no termination: the targets of the transitions before it keep Q̄(s', ·).
+            if step == start or step % config.checkpoint_interval == 0:
+                run.save(step)
+                observation, _ = env.reset(seed=common.derive_seed(config.seed, step))
+            if step % config.eval_interval == 0:
+                run.evaluate(step, agent.policy)
+            run.stop_if_requested(step)
 
             for _ in range(config.collect_steps_per_iteration):
                 observation = collect_step(env, observation, agent.act(observation), buffer, run)
             batch = buffer.sample(config.batch_size, agent.generator)
-            metrics = agent.update(batch, update)
-            run.log(update + 1, metrics)  # a row every log_interval updates
+            metrics = agent.update(batch, step)
+            run.log(step + 1, metrics)  # a row every log_interval updates
 
         env.close()
         run.finish(config.num_iterations, observation_space.shape)  # checkpoint, evaluation, curve, films

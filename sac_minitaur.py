@@ -7,16 +7,16 @@
     python sac_minitaur.py --tutorial                         # the tutorials' own choices, which learn little
     torchrun --nproc-per-node 2 sac_minitaur.py               # two processes, one agent
 
-The actor π samples its actions. How random they are is the entropy, the mean of −log π(a|s); α is its weight. Two
-critics estimate Q(s, a): the rewards from action a on, and α × the entropies of the steps after it. The actor learns to
-make Q + α × entropy large: it earns much but stays random, and so it explores. α is tuned until the entropy has a given
-value. The critics move to a target:
+The actor is a network that gives a density π(a|s) of actions, and samples from it. How random the actions are is the
+entropy, the mean of −log π(a|s). Two critics estimate Q(s, a): the rewards from action a on, and α × the entropies of
+the steps after it. The actor learns to make Q + α × entropy large: it earns much but stays random, and so it explores.
+α is tuned until the entropy has a given value. The critics move to a target, with r, γ and s' as in dqn_cartpole.py:
 
-    y = r + γ (min Q(s', a') − α log π(a'|s')), with a' ~ π(·|s'), and r, γ and s' as in dqn_cartpole.py
+    y = r + γ (min Q(s', a') − α log π(a'|s')) with a' ~ π(·|s'), or y = r where the robot fell
 
 The minimum is over the two critics, not over actions. The actor uses it, too: an actor that maximizes one estimate
-exploits its errors. In the paper slow copies of the critics, the target critics, compute y. Ours compute it themselves,
-as in CrossQ, a later variant of SAC (arXiv:1902.05605): batch normalization makes their learning stable enough.
+exploits its errors. In SAC's paper slow copies of the critics, the target critics, compute y. Here the critics compute
+it themselves, as in CrossQ, a later variant of SAC (arXiv:1902.05605): batch normalization makes this stable enough.
 
 It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
 Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
@@ -43,14 +43,14 @@ import common
 
 @dataclass(frozen=True, config=common.CONFIG)
 class Config:
-    """Soft Actor-Critic on the Minitaur. Values are the tutorials' unless a line says "ours"."""
+    """Soft Actor-Critic on the Minitaur. Values are the tutorials' of 2021 and 2023 unless a line says "ours"."""
 
     env_id: common.Task = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
     max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
     num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, of all environments together
     collect_steps_per_iteration: PositiveInt = 1  # steps of each environment for each update
-    num_envs: common.Count = 4  # ours (theirs: 1): environments stepped at once by each process, each in a worker
+    num_envs: common.Count = 4  # ours (theirs: 1): environments at once, each in a worker process
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
     actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): actor and α move in every third update
@@ -58,19 +58,19 @@ class Config:
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
-    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε. Keras has this value, but adds it before the bias correction
-    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, which leaves α's at 0.9
+    adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε, Keras's value
+    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but here α's, too
     privileged_critics: bool = True  # ours (theirs: no): critics see speed, turning and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
     gamma: common.Fraction = 0.99  # discount
     time_limit_terminates: bool = False  # ours (theirs: yes): a time limit counts as an end of the task
-    observation_scaling: bool = True  # ours (theirs: no): bring observations to [-1, 1]: `common.ObservationScaling`
+    observation_scaling: bool = True  # ours (theirs: no): bring observations near [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): the policy averages actors: see `soft_update`
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): the policy averages actors: see `SACAgent`
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): a density's may be negative; uniform has ln 2 = 0.69
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): per number of an action; a uniform has ln 2 = 0.69
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -109,7 +109,7 @@ TUTORIAL = {
 
 
 # In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action.
-# The agent and the buffer take observations (…, S); the actor uses their first O numbers.
+# The agent and the buffer take observations (…, S), the critics' states; the actor uses the first O numbers.
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -127,7 +127,7 @@ def mlp(inputs, hidden_layers, outputs, batch_norm=False):
 
 
 class Actor(nn.Module):
-    """A Gaussian over actions, squashed by tanh into (-1, 1). Of the S numbers that critics see it uses the first O."""
+    """A Gaussian over actions, squashed by tanh into (-1, 1). It uses only the first O of the S numbers of a state."""
 
     def __init__(self, observation_size, action_size, hidden_layers):
         super().__init__()
@@ -136,21 +136,22 @@ class Actor(nn.Module):
 
     def forward(self, observation):
         """Mean and log standard deviation before squashing, (…, A) each, for observations (…, O or more)."""
-        mean, log_std = self.net(observation[..., : self.observation_size]).chunk(2, dim=-1)
-        return mean, log_std.clamp(-20, 2)  # ours, also with --tutorial: the bounds in the authors' code
+        outputs = self.net(observation[..., : self.observation_size])
+        mean, log_std = outputs.chunk(2, dim=-1)
+        return mean, log_std.clamp(-20, 2)  # ours, also with --tutorial: the bounds of 2018 and of the authors' code
 
     def sample(self, observation):
         """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
 
-        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The code computes
-        log(1 − tanh²u) as 2 (log 2 − u − softplus(−2u)), which is equal, but finite where tanh u rounds to ±1.
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The code computes the
+        slope's log(1 − tanh²u) as 2 (log 2 − u − softplus(−2u)), which is equal, but finite where tanh u rounds to ±1.
         """
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
         u = mean + log_std.exp() * noise
         log_density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)  # log N(u): noise = (u − mean) / σ
-        log_determinant = 2 * (math.log(2) - u - F.softplus(-2 * u))
-        return u.tanh(), (log_density - log_determinant).sum(-1)
+        log_slope = 2 * (math.log(2) - u - F.softplus(-2 * u))
+        return u.tanh(), (log_density - log_slope).sum(-1)
 
 
 class TwinCritics(nn.Module):
@@ -172,7 +173,7 @@ class Policy(nn.Module):
 
     def __init__(self, config, observation_space, action_space):
         super().__init__()
-        self.action_space = action_space
+        self.action_dtype = action_space.dtype
         self.scaling = common.ObservationScaling(observation_space) if config.observation_scaling else nn.Identity()
         self.actor = Actor(math.prod(observation_space.shape), math.prod(action_space.shape), config.actor_layers)
         low = np.float32(action_space.low)
@@ -192,8 +193,7 @@ class Policy(nn.Module):
     def act(self, observation):
         """The action for one observation, from numpy to numpy, in the action space's own type. Only on the CPU."""
         batch = torch.from_numpy(np.array(observation, np.float32))[None]
-        action = self(batch)[0].numpy()
-        return action.astype(self.action_space.dtype).clip(self.action_space.low, self.action_space.high)
+        return self(batch)[0].numpy().astype(self.action_dtype)
 
 
 def to_bounds(action, low, high):
@@ -218,7 +218,7 @@ class ReplayBuffer:
         self.position = 0
 
     def add(self, observations, actions, rewards, terminated, next_observations):
-        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). A full one drops its oldest."""
+        """Stores K transitions, numpy (K, S), (K, *action shape), (K,), (K,), (K, S). If full, it drops the oldest."""
         count = len(rewards)
         rows = (self.position + torch.arange(count)) % self.capacity
         # .to(self.rewards): to the buffer's device, in float32
@@ -270,7 +270,7 @@ def alpha_loss(log_alpha, log_probs, target_entropy):
 
 
 class SACAgent(nn.Module):
-    """Actor, twin critics and the temperature α, with their optimizers, and the policy that is evaluated.
+    """Actor, twin critics and the entropy's weight α, with their optimizers, and the policy that is evaluated.
 
     The actor sees the task's observation, O numbers. The critics see S = `state_size` numbers: these O and the
     privileged ones. The policy's actor is a running average of the actor, because a single snapshot may be bad.
@@ -296,8 +296,7 @@ class SACAgent(nn.Module):
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), config.critic_learning_rate, **adam)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), config.actor_learning_rate, **adam)
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], config.alpha_learning_rate, **adam)
-        # What a checkpoint saves. (`a.load_state_dict(b.state_dict())` makes two optimizers share moments: deepcopy.)
-        self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer, self.alpha_optimizer]  # a checkpoint saves them
 
     def random_actions(self, count):
         """Uniform actions (K, *action shape) in [-1, 1], numpy."""
@@ -316,7 +315,7 @@ class SACAgent(nn.Module):
             variance = (rewards - mean).square().mean()
             common.average([variance])
             std = variance.sqrt()
-            # Rewards that were all equal stay as they are. Rounding may make their std slightly more than 0.
+            # Rewards that were all equal are not divided. Rounding may make their std slightly more than 0.
             divisor = torch.where(std > 1e-6 * mean.abs(), std, 1.0)
             self.reward_scale.copy_(self.config.reward_scale_factor / divisor)
 
@@ -363,7 +362,8 @@ class SACAgent(nn.Module):
             # different means and variances, and Q(s, a) and Q(s', a') would be two functions. No gradient reaches
             # next_q, because y is computed under no_grad.
             self.critics.train()
-            q, next_q = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a))).chunk(2, dim=1)  # (2, B) each
+            both = self.critics(torch.cat((s, next_s)), torch.cat((a, next_a)))  # (2, 2B)
+            q, next_q = both.chunk(2, dim=1)  # (2, B) each
             self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
@@ -372,8 +372,9 @@ class SACAgent(nn.Module):
         self.critic_optimizer.zero_grad()
         loss.backward()
         # Several processes: the mean of their gradients, and of batch normalization's running means and variances.
-        statistics = [buffer for buffer in self.critics.buffers() if buffer.is_floating_point()]
-        common.average([*(parameter.grad for parameter in self.critics.parameters()), *statistics])
+        gradients = [parameter.grad for parameter in self.critics.parameters()]
+        statistics = [tensor for tensor in self.critics.buffers() if tensor.is_floating_point()]  # not the step counter
+        common.average(gradients + statistics)
         self.critic_optimizer.step()
         if not config.critic_batch_norm:  # the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
             soft_update(self.target_critics, self.critics, config.target_update_tau)
@@ -392,7 +393,8 @@ class SACAgent(nn.Module):
         loss.backward()
         self.alpha_optimizer.zero_grad()
         loss_alpha.backward()
-        common.average([*(parameter.grad for parameter in self.actor.parameters()), self.log_alpha.grad])
+        gradients = [parameter.grad for parameter in self.actor.parameters()]
+        common.average([*gradients, self.log_alpha.grad])
         self.actor_optimizer.step()
         self.alpha_optimizer.step()
         self.critics.requires_grad_(True)
@@ -410,7 +412,7 @@ def soft_update(target, source, tau):
 
 
 def cuda_graph(agent, function):
-    """For --cuda-graph: `function(batch)` of the agent, of which the third call is recorded, and replayed from then on.
+    """For --cuda-graph: wraps `function(batch)`. Its third call is recorded, and later calls replay the record.
 
     Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. A recorded
     update repeats the same operations: leave --cuda-graph out when your update has an `if` on data.
@@ -433,7 +435,7 @@ def cuda_graph(agent, function):
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
             recorded = batch
-            with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # computes nothing, replays do
+            with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # of this GPU; computes nothing
                 metrics = function(recorded)
             for group in groups:
                 group["capturable"] = False  # a checkpoint would have True, and a run without a graph would warn
@@ -487,7 +489,7 @@ def make_training_env(task, privileged, main_process):
 def make_vector_env(task, config):
     """`num_envs` environments (K), each in a worker process. One whose episode has ended resets itself at once."""
     make = partial(make_training_env, task, config.privileged_critics, os.getpid())
-    method = common.start_method(config.env_id)
+    method = common.start_method(config.env_id)  # fork, spawn or forkserver
     autoreset = gym.vector.AutoresetMode.SAME_STEP
     return gym.vector.AsyncVectorEnv([make] * config.num_envs, context=method, autoreset_mode=autoreset)
 
@@ -520,7 +522,6 @@ def train(config, resume=None):
     with common.Run("sac_minitaur", config, evaluate, (rank, world_size)) as run:  # it calls `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
-        run.stack.callback(envs.close, terminate=True)  # an ExitStack: closes them after an error, too
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
@@ -529,27 +530,28 @@ def train(config, resume=None):
             agent.update_critics = cuda_graph(agent, agent.update_critics)
             agent.update_actor = cuda_graph(agent, agent.update_actor)
         torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process
-        numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process's environments
+        env_numbers = range(rank * config.num_envs, (rank + 1) * config.num_envs)  # of this process
         start = run.begin(task, agent, buffer, checkpoint)  # restores a checkpoint. start: the updates done so far
 
-        if run.env_steps < config.initial_collect_steps:  # a resumed run has done this before
-            observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in numbers])
+        if run.env_steps < config.initial_collect_steps:  # most resumed runs are past this
+            observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i) for i in env_numbers])
             while run.env_steps < config.initial_collect_steps:
                 run.stop_if_requested(start)
                 actions = agent.random_actions(config.num_envs)
                 observations = store(buffer, observations, actions, envs.step(actions), run)
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
-        for update in range(start, config.num_iterations):
+        for step in range(start, config.num_iterations):
             # gymnasium cannot save a task in mid-episode, and pybullet does not restore contacts exactly. So a resumed
-            # run begins new episodes at its checkpoint. One left alone does so, too, at every checkpoint: both are the
-            # same to the bit. The cut is no termination: the targets of the transitions before it keep Q(s', a').
-            if update == start or update % config.checkpoint_interval == 0:
-                run.save(update)
-                observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, update) for i in numbers])
-            if update % config.eval_interval == 0:
-                run.evaluate(update, agent.policy)
-            run.stop_if_requested(update)
+            # run begins new episodes at its checkpoint. Every run does so at every checkpoint: then a run that was
+            # killed and resumed equals one that was left alone. The cut is no termination: the targets of the
+            # transitions before it keep Q(s', a').
+            if step == start or step % config.checkpoint_interval == 0:
+                run.save(step)
+                observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, step) for i in env_numbers])
+            if step % config.eval_interval == 0:
+                run.evaluate(step, agent.policy)
+            run.stop_if_requested(step)
 
             for _ in range(config.collect_steps_per_iteration - 1):  # all but the last, which the update accompanies
                 actions = agent.act(observations)
@@ -558,9 +560,9 @@ def train(config, resume=None):
             actions = agent.act(observations)
             envs.step_async(actions)
             batch = buffer.sample(config.batch_size // world_size)  # this process's share of the batch
-            metrics = agent.update(batch, update)
+            metrics = agent.update(batch, step)
             observations = store(buffer, observations, actions, envs.step_wait(), run)
-            run.log(update + 1, metrics)  # a row every log_interval updates, with the latest of each metric
+            run.log(step + 1, metrics)  # a row every log_interval updates, with the latest of each metric
 
         envs.close()
         run.finish(config.num_iterations, observation_space.shape)  # checkpoint, evaluation, curve, films
@@ -585,7 +587,7 @@ class Dynamics:
 class Simulator:
     """A simulation of its own in this process, with pybullet's functions as methods.
 
-    Python's garbage collection disconnects it. pybullet's own `BulletClient` would print a line for each simulation.
+    Python's garbage collection disconnects it.
     """
 
     def __init__(self):
@@ -624,7 +626,9 @@ class MinitaurBulletEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
 
-    SUBSTEPS, SUBSTEP_SECONDS, SOLVER_ITERATIONS = 5, 0.002, 60
+    SUBSTEPS = 5
+    SUBSTEP_SECONDS = 0.002
+    SOLVER_ITERATIONS = 60
     MOTORS = tuple(f"{leg}{side}" for leg in ("front_left", "back_left", "front_right", "back_right") for side in "LR")
     DIRECTION = np.array([-1.0, -1, -1, -1, 1, 1, 1, 1])  # the motors of the left legs turn the other way
     BASE_LINK = -1
@@ -632,18 +636,24 @@ class MinitaurBulletEnv(gym.Env):
     MOTOR_LINKS = (1, 4, 7, 10, 14, 17, 20, 23)
     FOOT_LINKS = (3, 6, 9, 12, 16, 19, 22, 25)
     KNEE_ANGLE = -2.1834  # rad, in the start pose
-    KP, KD = 1.0, 0.02  # PD gains: share of the battery's voltage per rad and per rad/s
-    RESISTANCE, TORQUE_CONSTANT, NOMINAL_VOLTAGE = 0.186, 0.0954, 16.0  # Ω, N·m/A, V
-    MAX_NET_VOLTAGE, MAX_OBSERVED_TORQUE = 50.0, 5.7  # V, N·m
+    KP = 1.0  # of a PD controller: share of the battery's voltage per rad
+    KD = 0.02  # and per rad/s
+    RESISTANCE = 0.186  # Ω
+    TORQUE_CONSTANT = 0.0954  # N·m/A, and V·s/rad of the back-EMF, the voltage that a turning motor makes itself
+    NOMINAL_VOLTAGE = 16.0  # V
+    MAX_NET_VOLTAGE = 50.0  # V
+    MAX_OBSERVED_TORQUE = 5.7  # N·m
     CURRENTS = np.array([0.0, 10, 20, 30, 40, 50, 60])  # A
     TORQUES = np.array([0, 1, 1.9, 2.45, 3.0, 3.25, 3.5])  # N·m, a motor's at these currents: the iron saturates
-    OVERHEAT_TORQUE, OVERHEAT_SUBSTEPS = 2.45, 500  # N·m; a motor above it for more substeps in a row stays off
-    MIN_UPRIGHTNESS, MIN_HEIGHT = 0.85, 0.13  # cosine of the base's tilt; m. Below either, the robot has fallen
+    OVERHEAT_TORQUE = 2.45  # N·m
+    OVERHEAT_SUBSTEPS = 500  # a motor above this torque for more substeps in a row stays off
+    MIN_UPRIGHTNESS = 0.85  # cosine of the base's tilt. Below it the robot has fallen
+    MIN_HEIGHT = 0.13  # m, of the base. Below it, too
 
     def __init__(self, render_mode=None):
         self.render_mode = render_mode
         self.simulator = Simulator()
-        max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT
+        max_velocity = self.NOMINAL_VOLTAGE / self.TORQUE_CONSTANT  # rad/s, where the back-EMF takes all the voltage
         high = np.repeat([math.pi, max_velocity, self.MAX_OBSERVED_TORQUE, 1.0], [8, 8, 8, 4]) + 0.01  # a margin
         self.observation_space = gym.spaces.Box(np.float32(-high), np.float32(high))
         self.privileged_space = gym.spaces.Box(-np.inf, np.inf, (7,), np.float32)
@@ -652,7 +662,10 @@ class MinitaurBulletEnv(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self._build()
-        self.dynamics = (options or {}).get("dynamics") or self._draw_dynamics()
+        if options and "dynamics" in options:
+            self.dynamics = options["dynamics"]
+        else:
+            self.dynamics = self._draw_dynamics()
         self._apply_dynamics()
         self.hot_substeps = np.zeros(8)
         self.motor_enabled = np.ones(8, bool)
@@ -660,6 +673,7 @@ class MinitaurBulletEnv(gym.Env):
         self._read_motors()
         for _ in range(100):  # holds the start pose for 0.2 s
             self._substep(math.pi / 2)
+        self._read_base()
         return self._observation(), {}
 
     def _build(self):
@@ -695,7 +709,8 @@ class MinitaurBulletEnv(gym.Env):
         return Dynamics(*masses, uniform(14.8, 16.8), uniform(0, 0.01), uniform(0.8, 1.5))
 
     def _apply_dynamics(self):
-        change, dynamics = self.simulator.changeDynamics, self.dynamics
+        change = self.simulator.changeDynamics
+        dynamics = self.dynamics
         change(self.robot, self.BASE_LINK, mass=dynamics.base_mass)
         for link in self.LEG_LINKS:
             change(self.robot, link, mass=dynamics.leg_mass)
@@ -712,14 +727,14 @@ class MinitaurBulletEnv(gym.Env):
         command = self._motor_angles(action)
         for _ in range(self.SUBSTEPS):
             self._substep(command)
-        observation = self._observation()
+        self._read_base()
         x, _, height = self.position
         energy = abs(np.dot(self.observed_torque, self.velocity)) * self.SUBSTEP_SECONDS  # one substep, as pybullet
         reward = x - self.x - 0.005 * energy
         self.x = x
         up_z = self.simulator.getMatrixFromQuaternion(self.orientation)[8]
         fallen = up_z < self.MIN_UPRIGHTNESS or height < self.MIN_HEIGHT
-        return observation, float(reward), fallen, False, {}
+        return self._observation(), float(reward), fallen, False, {}
 
     @staticmethod
     def _motor_angles(action):
@@ -728,34 +743,40 @@ class MinitaurBulletEnv(gym.Env):
         Extension turns the two motors of a leg by the same angle, swing by opposite angles, mirrored on the right. The
         order of operations and the action's own precision are the original's: so are the roundings.
         """
-        swing, extension = np.repeat(action[:4], 2), np.repeat(action[4:], 2)
-        per_swing = np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype) * action.dtype.type(math.pi / 4)  # rad
+        swing = np.repeat(action[:4], 2)
+        extension = np.repeat(action[4:], 2)
+        per_swing = math.pi / 4 * np.array([1, -1, 1, -1, -1, 1, -1, 1], action.dtype)  # rad
         return math.pi - math.pi / 4 * (extension + 1.5) + per_swing * swing  # 1.5: pybullet's offset_for_singularity
 
     def _substep(self, command):
         """Drives the motors towards the angles `command` for 0.002 s, in the order of pybullet's motor.py."""
-        simulator, dynamics = self.simulator, self.dynamics
+        simulator = self.simulator
+        dynamics = self.dynamics
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)  # share of the voltage
         drive = pwm * dynamics.voltage
         # The robot observes a torque without back-EMF and the iron's saturation. The torque that moves it has both.
         limit = self.MAX_OBSERVED_TORQUE
         self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(-limit, limit)
-        back_emf = (self.TORQUE_CONSTANT + dynamics.viscous_damping) * self.velocity
+        back_emf = (self.TORQUE_CONSTANT + dynamics.viscous_damping) * self.velocity  # pybullet adds the damping here
         current = (drive - back_emf).clip(-self.MAX_NET_VOLTAGE, self.MAX_NET_VOLTAGE) / self.RESISTANCE
         torque = np.interp(np.abs(current), self.CURRENTS, self.TORQUES)
-        self.hot_substeps = (self.hot_substeps + 1) * (torque > self.OVERHEAT_TORQUE)
+        self.hot_substeps = np.where(torque > self.OVERHEAT_TORQUE, self.hot_substeps + 1, 0)
         self.motor_enabled &= self.hot_substeps <= self.OVERHEAT_SUBSTEPS
-        force = (np.sign(current) * torque * self.DIRECTION * self.motor_enabled).tolist()
-        simulator.setJointMotorControlArray(self.robot, self.motor_joints, simulator.TORQUE_CONTROL, forces=force)
+        force = np.sign(current) * torque * self.DIRECTION * self.motor_enabled
+        mode = simulator.TORQUE_CONTROL
+        simulator.setJointMotorControlArray(self.robot, self.motor_joints, mode, forces=force.tolist())
         simulator.stepSimulation()
         self._read_motors()
 
     def _read_motors(self):
         angle, velocity, _, _ = zip(*self.simulator.getJointStates(self.robot, self.motor_joints))
-        self.angle, self.velocity = np.array(angle) * self.DIRECTION, np.array(velocity) * self.DIRECTION
+        self.angle = np.array(angle) * self.DIRECTION
+        self.velocity = np.array(velocity) * self.DIRECTION
+
+    def _read_base(self):
+        self.position, self.orientation = self.simulator.getBasePositionAndOrientation(self.robot)
 
     def _observation(self):
-        self.position, self.orientation = self.simulator.getBasePositionAndOrientation(self.robot)
         return np.concatenate((self.angle, self.velocity, self.observed_torque, self.orientation), dtype=np.float32)
 
     def privileged_observation(self):
@@ -774,7 +795,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # its finalizer disconnects. Twice could close a newer simulation with the same number
+        self.simulator = None  # its finalizer disconnects, once: a newer simulation may have the same number
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:

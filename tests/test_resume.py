@@ -123,6 +123,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
     assert not list(run_dir.glob("*.mp4"))
     (run_dir / "notes.csv").write_text("a student's own\n")
     (run_dir / ".tmp-1-checkpoint.pt").write_text("left by a kill")
+    (run_dir / "best_policy.pt").write_bytes((run_dir / "policy.pt").read_bytes())  # of after the checkpoint
     # The real command, in a new interpreter, from another directory. The run knows that it was raised.
     run_python(tmp_path, ROOT / f"{script}.py", *resume)
     assert_same_run(run_dir, reference)
@@ -130,6 +131,16 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
     assert json.loads((run_dir / "config.json").read_text())["num_iterations"] == 300
     assert len(list(run_dir.glob("*.mp4"))) == 3
     assert (run_dir / "notes.csv").exists() and not list(run_dir.glob(".tmp-*"))
+
+
+def test_the_film_of_a_raised_run_is_that_of_a_longer_one(tmp_path):
+    """The policies in it do not depend on how many updates are wanted, but for the last."""
+    for num_iterations, expected in ((1000, [0, 10, 40, 160]), (200, [0, 10, 40, 160, 200])):
+        config = dqn_cartpole.Config(run_dir=tmp_path, device="cpu", num_iterations=num_iterations)
+        run = common.Run("dqn_cartpole", config, None)
+        for step in range(0, 201, 10):
+            run._keep(step, -math.inf, {})
+        assert [step for step, *_ in run.snapshots] == expected
 
 
 def test_what_may_change(script, reference):
@@ -150,13 +161,13 @@ def test_what_may_change(script, reference):
 
 
 def test_a_csv_keeps_its_columns(tmp_path):
-    """A metric that appears later goes to TensorBoard alone. One that is missing later is nan."""
+    """A metric that appears later goes to TensorBoard alone."""
     run = common.Run("dqn_cartpole", dqn_cartpole.Config(run_dir=tmp_path, device="cpu"), None)
     shown = []
     run.board = SimpleNamespace(add_scalar=lambda *scalar: shown.append(scalar))
     run._add_row("train", 20, {"loss": 1.5})
-    run._add_row("train", 40, {"one": 1.0})
-    assert rows(tmp_path / "train.csv") == [["step", "env_steps", "loss"], ["20", "0", "1.5"], ["40", "0", "nan"]]
+    run._add_row("train", 40, {"loss": 0.5, "one": 1.0})
+    assert rows(tmp_path / "train.csv") == [["step", "env_steps", "loss"], ["20", "0", "1.5"], ["40", "0", "0.5"]]
     assert ("train/loss", 1.5, 20) in shown and ("train/one", 1.0, 40) in shown
 
 
