@@ -254,7 +254,7 @@ def test_privileged_observation_is_in_the_bodys_own_frame(env):
     simulator, robot = minitaur.simulator, minitaur.robot
     orientation = simulator.getQuaternionFromEuler((0, 0, math.pi / 2))
     simulator.resetBasePositionAndOrientation(robot, (1, 2, 5), orientation)
-    minitaur._observation()
+    minitaur._read_base()
     simulator.resetBaseVelocity(robot, (-2, 1, 3), (-5, 4, 6))
     privileged = minitaur.privileged_observation()
     assert privileged.dtype == np.float32
