@@ -205,7 +205,7 @@ def test_an_error_of_the_task_ends_the_run_with_a_traceback(script, fault, regis
 RATES = {"sac_minitaur": {"critic_learning_rate": 1e30}, "dqn_cartpole": {"learning_rate": 1e30}}
 
 
-@pytest.mark.parametrize("log_interval, said", [(1, r"loss is (nan|inf) at step \d+;"), (10**6, r"is not finite")])
+@pytest.mark.parametrize("log_interval, said", [(1, r"loss is not finite at step \d+;"), (10**6, r"is not finite")])
 def test_a_run_that_diverges_ends(script, log_interval, said, register, tmp_path):
     """Before a checkpoint has such weights."""
     env_id = register(discrete=script == "dqn_cartpole")
