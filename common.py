@@ -509,6 +509,30 @@ def replay_tensors(buffer):
     return {name: value for name, value in vars(buffer).items() if torch.is_tensor(value)}
 
 
+def process_state(buffer, device):
+    """What a checkpoint keeps of each process: the rows of its replay, on the CPU, and its random numbers' state."""
+    state = {"size": buffer.size, "position": buffer.position, "random": torch.get_rng_state(), "replay": {}}
+    for name, rows in replay_tensors(buffer).items():
+        state["replay"][name] = rows[: buffer.size].to("cpu", copy=True)  # a slice would save all rows
+    if device.type == "cuda":
+        state["cuda_random"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def restore_process(state, buffer, device):
+    """Sets what `process_state` has returned. Raises RuntimeError or ValueError for another script's replay."""
+    replay = replay_tensors(buffer)
+    if replay.keys() != state["replay"].keys():
+        raise ValueError(f"the replay has {', '.join(replay)}, the checkpoint {', '.join(state['replay'])}")
+    for name, rows in state["replay"].items():
+        replay[name][: len(rows)] = rows
+    buffer.size = state["size"]
+    buffer.position = state["position"]
+    torch.set_rng_state(state["random"])
+    if device.type == "cuda" and "cuda_random" in state:
+        torch.cuda.set_rng_state(state["cuda_random"], device)
+
+
 def require_finite(values, step):
     """Raises FloatingPointError, naming the first of `values`, a dict of tensors or numbers, that is not finite."""
     for name, value in values.items():
@@ -538,13 +562,36 @@ def stop_signals():
             signal.signal(number, handler)
 
 
-def write_csv(path, rows):
-    """Writes a table, a list of dicts. It has the columns of its first row: later ones go to TensorBoard alone."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+class TableWriter:
+    """Shows a run's tables, lists of rows, in CSVs and TensorBoard. A row is a dict of numbers."""
+
+    def __init__(self, path, tables):
+        from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
+
+        for events in path.glob("events.out.tfevents.*"):
+            events.unlink()  # left before a resume: they may have rows of after the checkpoint
+        self.path = path
+        self.tables = tables
+        self.board = SummaryWriter(path)
+        for table, rows in tables.items():
+            for row in rows:
+                self._show(table, row)
+
+    def add(self, table, row):
+        """Adds a row. A CSV has the columns of its first row: later ones go to TensorBoard alone."""
+        rows = self.tables[table]
+        rows.append(row)
+        self._show(table, row)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, rows[0], extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_atomically(self.path / f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+
+    def _show(self, table, row):
+        for column, value in row.items():
+            if column != "step" and math.isfinite(value):
+                self.board.add_scalar(f"{table}/{column}", value, row["step"])
 
 
 class Run:
@@ -614,24 +661,14 @@ class Run:
     def _restore(self, saved):
         if len(saved["processes"]) != self.world_size:
             raise InputError(f"{self.path} was saved by {len(saved['processes'])} processes: continue it with as many")
-        own = saved["processes"][self.rank]
         try:
             self.agent.load_state_dict(saved["agent"])
             for optimizer, state in zip(self.agent.optimizers, saved["optimizers"], strict=True):
                 optimizer.load_state_dict(state)
-            replay = replay_tensors(self.buffer)
-            if replay.keys() != own["replay"].keys():
-                raise ValueError(f"the replay has {', '.join(replay)}, the checkpoint {', '.join(own['replay'])}")
-            for name, rows in own["replay"].items():
-                replay[name][: len(rows)] = rows
+            restore_process(saved["processes"][self.rank], self.buffer, self.device)
         except (RuntimeError, ValueError) as error:
             what = f"does not fit this script's networks, optimizers and replay ({one_line(error)})"
             raise InputError(f"{self.path} {what}: continue it with the script that saved it") from None
-        self.buffer.size = own["size"]
-        self.buffer.position = own["position"]
-        torch.set_rng_state(own["random"])
-        if self.device.type == "cuda" and "cuda_random" in own:
-            torch.cuda.set_rng_state(own["cuda_random"], self.device)
         for name in self.SAVED:
             setattr(self, name, saved[name])
         self.started = time.perf_counter() - saved["seconds"]
@@ -646,26 +683,16 @@ class Run:
                 raise InputError(f"{what}: name a new directory") from None
         text = to_json(self.plain_config, indent=2) + b"\n"
         write_atomically(self.path / "config.json", lambda file: file.write(text))
-        for path in (*self.path.glob("events.out.tfevents.*"), *self.path.glob(".tmp-*")):
-            path.unlink()  # left before a resume: the events are written anew below, and a kill leaves .tmp files
+        for path in self.path.glob(".tmp-*"):
+            path.unlink()  # left by a kill
         if self.best[1] is not None:  # after a resume: the file may have weights of after the checkpoint
             self._write("best_policy.pt", "policy", {"weights": self.best[1]})
-        from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
-
-        self.board = SummaryWriter(self.path)
-        self.stack.callback(self.board.close)
-        for table, rows in self.tables.items():
-            for row in rows:
-                self._show(table, row)
+        self.writer = TableWriter(self.path, self.tables)
+        self.stack.callback(self.writer.board.close)
 
     def save(self, step):
         """Saves a checkpoint, and the policy for --evaluate. Raises FloatingPointError for bad weights."""
-        buffer = self.buffer
-        own = {"replay": {}, "size": buffer.size, "position": buffer.position, "random": torch.get_rng_state()}
-        for name, rows in replay_tensors(buffer).items():
-            own["replay"][name] = rows[: buffer.size].to("cpu", copy=True)  # a slice would save all rows
-        if self.device.type == "cuda":
-            own["cuda_random"] = torch.cuda.get_rng_state(self.device)
+        own = process_state(self.buffer, self.device)
         processes = [own] * self.world_size if self.rank == 0 else None
         if self.world_size > 1:
             dist.gather_object(own, processes)  # fills process 0's list
@@ -715,16 +742,7 @@ class Run:
 
     def _add_row(self, table, step, values):
         seconds = round(time.perf_counter() - self.started, 3)
-        row = {"step": step, "env_steps": self.env_steps, "seconds": seconds} | values
-        self.tables[table].append(row)
-        self._show(table, row)
-        write_csv(self.path / f"{table}.csv", self.tables[table])
-
-    def _show(self, table, row):
-        """Shows the row of a table to TensorBoard."""
-        for column, value in row.items():
-            if column != "step" and math.isfinite(value):
-                self.board.add_scalar(f"{table}/{column}", value, row["step"])
+        self.writer.add(table, {"step": step, "env_steps": self.env_steps, "seconds": seconds} | values)
 
     def evaluate(self, step, policy):
         """Plays the evaluation episodes with `policy` (None: random actions) and logs them, once for each step.

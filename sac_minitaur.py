@@ -404,11 +404,9 @@ class SACAgent(nn.Module):
 
 @torch.no_grad()
 def soft_update(target, source, tau):
-    """Moves the parameters of `target` by the fraction `tau` towards those of `source`, and copies its buffers."""
+    """Moves the parameters of `target` by the fraction `tau` towards those of `source`."""
     for slow, parameter in zip(target.parameters(), source.parameters()):
         slow.lerp_(parameter, tau)
-    for slow, buffer in zip(target.buffers(), source.buffers()):
-        slow.copy_(buffer)  # running statistics, if you give the actor batch normalization
 
 
 def cuda_graph(agent, function):

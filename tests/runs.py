@@ -48,14 +48,13 @@ def flags(script, run_dir, *more):
 class Process:
     """One run, started at once; `output` is a new directory for what it prints."""
 
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*MODULES, "pytest", "matplotlib.figure", "torch.utils.tensorboard"])
-
     def __init__(self, script, arguments, output, hook=None, **environ):
         self.output = Path(output)
         self.output.mkdir(parents=True)
         command_line = [f"{script}.py", *map(str, arguments)]
-        self.process = self.context.Process(target=run, args=(script, command_line, output, hook, environ))
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([*MODULES, "pytest", "matplotlib.figure", "torch.utils.tensorboard"])
+        self.process = context.Process(target=run, args=(script, command_line, output, hook, environ))
         self.process.start()
         self.pid = self.process.pid
 

@@ -115,7 +115,7 @@ def test_two_processes_train_one_agent_and_resume_exactly(tmp_path):
 
 
 def test_all_stop_with_one(tmp_path):
-    """Of two processes the second alone is asked to stop, in its random steps or later."""
+    """Of two processes the second alone is asked to stop."""
     more = ["--num-iterations", 10**6, "--replay-buffer-capacity", 10**6]
     ranks = start_ranks(flags(SCRIPT, tmp_path / "run", *more), tmp_path / "output")
     wait_until((tmp_path / "run" / "train.csv").exists)

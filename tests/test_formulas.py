@@ -32,7 +32,7 @@ def dqn_agent(**choices):
     torch.manual_seed(0)
     config = dqn_cartpole.Config(**{"layers": (8, 6)} | choices)
     space = gym.spaces.Box(np.float32([-4, -np.inf, -0.4, -np.inf]), np.float32([4, np.inf, 0.4, np.inf]))
-    return DQNAgent(config, space, gym.spaces.Discrete(2), torch.device(choices.get("device", "cpu")))
+    return DQNAgent(config, space, gym.spaces.Discrete(2), CPU)
 
 
 def dqn_batch(size=64):
@@ -56,8 +56,8 @@ def test_gap_to_best():
 
 @pytest.mark.parametrize("tutorial", (False, True))
 def test_dqn_update(tutorial):
-    """Its loss and gradients, from the formulas: textbook DQN with the tutorial's choices, and with ours."""
-    choices = {"gamma": 0.9, "target_update_tau": 0.25}
+    """From the formulas, with Adam's first step −lr · g / (|g| + ε): textbook DQN as the tutorial's, and ours."""
+    choices = {"gamma": 0.9, "target_update_tau": 0.25, "learning_rate": 0.01, "adam_epsilon": 0.03}
     agent = dqn_agent(**(dqn_cartpole.TUTORIAL | choices if tutorial else choices))
     agent.target_network.load_state_dict(QNetwork(4, 2, (8, 6)).state_dict())  # unlike the Q-network
     old_target = [parameter.clone() for parameter in agent.target_network.parameters()]
@@ -80,24 +80,16 @@ def test_dqn_update(tutorial):
     loss = (y - q).square().mean()
     gradients = torch.autograd.grad(loss, list(agent.q_network.parameters()))
     old = [parameter.detach().clone() for parameter in agent.q_network.parameters()]
-    metrics = agent.update(batch, 0)
+    metrics = agent.update(batch, 6000)
+    learning_rate = 0.01 if tutorial else 0.01 / (1 + (6000 / 3000) ** 2)
     torch.testing.assert_close(metrics, {"loss": loss.detach(), "mean_q": q.mean().detach()})
     moved = zip(gradients, old, old_target, agent.q_network.parameters(), agent.target_network.parameters())
     for gradient, before, target_before, after, target in moved:
         torch.testing.assert_close(after.grad, gradient)
-        assert (after != before).any() and not target.requires_grad
+        step = -learning_rate * gradient / (gradient.abs() + 0.03)
+        torch.testing.assert_close(after.detach(), before + step, rtol=1e-5, atol=1e-6)
+        assert gradient.any() and not target.requires_grad
         torch.testing.assert_close(target, 0.75 * target_before + 0.25 * after.detach())
-
-
-def test_dqn_learning_rate():
-    """It is half after 2 updates with a decay of 2, a tenth after 6, and stays as it is without."""
-    for decay, expected in ((2, [0.01, 0.005, 0.001]), (None, 3 * [0.01])):
-        agent = dqn_agent(learning_rate=0.01, learning_rate_decay=decay)
-        rates = []
-        for step in (0, 2, 6):
-            agent.update(dqn_batch(), step)
-            rates.append(agent.optimizer.param_groups[0]["lr"])
-        assert rates == pytest.approx(expected)
 
 
 def test_dqn_starts_as_the_tutorials_network():
@@ -122,7 +114,7 @@ def test_dqn_acts_greedily_but_for_a_part_of_the_actions():
         agent.q_network.net[-1].bias[0] += gap.median()  # each action is best in half of the states
     greedy = agent.q_network(agent.scaling(observations)).argmax(1)
     assert torch.equal(agent.policy(observations), greedy) and greedy.sum() == pytest.approx(2000, abs=50)
-    action = agent.policy.act(observations[0].numpy())
+    action = agent.policy.act(observations[0].double().numpy())
     assert action == greedy[0] and type(action) is np.int64  # as its space's samples
     assert agent.act(np.zeros(4)) in (0, 1)  # float64
     actions = torch.tensor([agent.act(observation) for observation in observations.numpy()])
@@ -411,7 +403,7 @@ def test_only_the_critics_see_the_end_of_a_longer_observation():
     sampled, _ = agent.actor.sample(observations[:, :3])
     for seen in (observations, others):
         torch.manual_seed(7)
-        assert torch.equal(torch.from_numpy(agent.act(seen.numpy())), sampled.detach())
+        assert torch.equal(torch.from_numpy(agent.act(seen.double().numpy())), sampled.detach())  # float64, as MuJoCo's
     assert (agent.critics(observations, torch.zeros(4, 2)) != agent.critics(others, torch.zeros(4, 2))).all()
 
 
@@ -433,7 +425,7 @@ def test_replay_buffers_sample_all_that_is_stored_and_nothing_else():
     two = sac_minitaur.ReplayBuffer(5, 2, 1, CPU)
     for first, count, stored in ((0, 4, {0, 1, 2, 3}), (4, 4, {3, 4, 5, 6, 7})):  # the second wraps around
         n = np.arange(first, first + count)
-        observations = np.stack((n, n + 0.5), axis=1).astype(np.float32)
+        observations = np.stack((n, n + 0.5), axis=1)  # float64, as MuJoCo's
         actions = n % 2
         for i in range(count):
             one.add(observations[i], actions[i], 10.0 * n[i], n[i] == 6, observations[i] + 0.25)
@@ -448,6 +440,8 @@ def test_replay_buffers_sample_all_that_is_stored_and_nothing_else():
             assert torch.equal(actions.flatten(), n.to(actions.dtype) % 2)
             assert torch.equal(terminated, (n == 6).float())
             assert torch.equal(next_observations, observations_ + 0.25)
+    draws = [one.sample(9, torch.Generator().manual_seed(1))[2] for _ in range(2)]
+    assert torch.equal(*draws)
 
 
 @pytest.mark.parametrize("time_limit_terminates", (False, True))

@@ -4,7 +4,10 @@ import io
 import multiprocessing
 import os
 import re
+import runpy
+import signal
 import sys
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,6 +15,7 @@ import imageio
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 import common
 import dqn_cartpole
@@ -29,13 +33,13 @@ class Echo(gym.Env):
 
     def __init__(self, render_mode=None, low=-1, high=1, dtype=np.float32, discrete=False, fault=None, folder=None):
         self.render_mode = render_mode
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
-        box = gym.spaces.Box(low, high, np.shape(low) or (1,), dtype)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1, 2))
+        box = gym.spaces.Box(low, high, np.shape(low) or (1, 1), dtype)
         self.action_space = gym.spaces.Discrete(2) if discrete else box
         self.fault = fault
         self.state = np.zeros(2, np.float32)
         if folder:
-            Path(folder, f"{os.getpid()}-{id(self)}").touch()
+            Path(folder, f"{os.getpid()}-{time.monotonic_ns()}").touch()
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -57,7 +61,8 @@ class Echo(gym.Env):
         return self._observation(), float(self.state[0]), False, False, {}
 
     def _observation(self):
-        return self.state if self.fault == "in place" else self.state.copy()
+        observation = self.state[None]
+        return observation if self.fault == "in place" else observation.copy()
 
     def render(self):
         return None if self.fault == "render" else np.full((32, 48, 3), 10 * self.state[0], np.uint8)
@@ -91,7 +96,8 @@ def test_arrays_that_a_task_changes_in_place(script, register, tmp_path):
     """Copies of observations and actions are stored, in the order of the steps. Each worker makes the task once."""
     num_envs = {"num_envs": 2} if script == "sac_minitaur" else {}
     env_id = register(fault="in place", high=3, discrete=script == "dqn_cartpole", folder=str(tmp_path))
-    path = train(script, tmp_path / "run", env_id=env_id, replay_buffer_capacity=1000, **num_envs)
+    choices = num_envs | {"replay_buffer_capacity": 1000, "collect_steps_per_iteration": 3}
+    path = train(script, tmp_path / "run", env_id=env_id, **choices)
     replay = checkpoint(path)["processes"][0]["replay"]
     observations, next_observations = replay["observations"], replay["next_observations"]
     assert torch.equal(next_observations[:, 0], observations[:, 0] + 1)
@@ -108,7 +114,7 @@ def test_arrays_that_a_task_changes_in_place(script, register, tmp_path):
     assert (row["collect_return"], row["collect_episode_length"]) == (10, 4)
     rows = read_csv(path / "eval.csv")
     assert {(row["average_return"], row["average_episode_length"]) for row in rows} == {(10, 4)}
-    assert [row["env_steps"] for row in rows] == [40, 40 + 10 * step, 40 + 20 * step]
+    assert [row["env_steps"] for row in rows] == [40, 40 + 30 * step, 40 + 60 * step]
     made = [path.name.split("-")[0] for path in tmp_path.glob("*-*")]
     in_workers = [pid for pid in made if int(pid) != os.getpid()]
     assert in_workers and len(in_workers) == len(set(in_workers))
@@ -145,7 +151,7 @@ def test_float16_trains_evaluates_and_exports(register, tmp_path, monkeypatch, c
     output = capsys.readouterr().out
     assert f"AverageReturn = {read_csv(path / 'eval.csv')[-1]['average_return']:.6f}" in output
     assert "filmed one episode" in output and (path / "policy.mp4").exists()
-    observations = torch.rand(5, 2)
+    observations = torch.rand(5, 1, 2)
     exported = torch.export.load(path / "policy.pt2").module()(observations)
     assert torch.equal(exported, load_policy(path / "policy.pt")(observations))
 
@@ -160,7 +166,7 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(register, tmp_path, ca
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
 
 
-def test_workers_are_clean(tmp_path):
+def test_workers_are_clean(tmp_path, monkeypatch):
     """As a task on JAX, this one starts a thread where it is imported, and works in no process that is forked later."""
     (tmp_path / "threaded_task.py").write_text("""
 import os, threading
@@ -176,12 +182,14 @@ gymnasium.register("Mine-v0", Task, max_episode_steps=4)
 """)
     flags = "--initial-collect-steps 150 --num-iterations 2 --num-eval-episodes 2 --num-envs 1 --no-video --device cpu"
     run_python(tmp_path, ROOT / "sac_minitaur.py", "--env-id", "threaded_task:Mine-v0", *flags.split())
+    monkeypatch.setitem(sys.modules, "jax", sys)
+    assert common.start_method("Mine-v0") == "forkserver"
 
 
 def test_a_task_that_seeds_the_global_generator_repeats_no_batch(register, tmp_path):
     path = train("dqn_cartpole", tmp_path / "run", env_id=register(fault="seed", discrete=True), epsilon=1.0)
     replay = checkpoint(path)["processes"][0]["replay"]
-    actions = replay["actions"].view(-1, 4)  # by episode
+    actions = replay["actions"].view(-1, 4)
     assert len(actions.unique(dim=0)) > 6
 
 
@@ -205,12 +213,16 @@ def test_an_error_of_the_task_ends_the_run_with_a_traceback(script, fault, regis
 RATES = {"sac_minitaur": {"critic_learning_rate": 1e30}, "dqn_cartpole": {"learning_rate": 1e30}}
 
 
-@pytest.mark.parametrize("log_interval, said", [(1, r"loss is not finite at step \d+;"), (10**6, r"is not finite")])
-def test_a_run_that_diverges_ends(script, log_interval, said, register, tmp_path):
-    """Before a checkpoint has such weights."""
+@pytest.mark.parametrize("log_interval, checkpoint_interval", [(1, 10), (1000, 10), (1000, 40)])
+def test_a_run_that_diverges_ends(script, log_interval, checkpoint_interval, register, tmp_path):
+    """Before a checkpoint has such weights: a row, a checkpoint or an evaluation finds them, or SAC's actions."""
+    intervals = {"log_interval": log_interval, "checkpoint_interval": checkpoint_interval, "num_iterations": 50}
     env_id = register(discrete=script == "dqn_cartpole")
-    with pytest.raises(FloatingPointError, match=f"{said}|the actor's actions are not finite"):
-        train(script, tmp_path / "run", env_id=env_id, log_interval=log_interval, num_iterations=50, **RATES[script])
+    said = r"loss is not finite at step \d+;" if log_interval == 1 else "is not finite at step 10;"
+    if script == "sac_minitaur":
+        said = f"{said}|the actor's actions are not finite"
+    with pytest.raises(FloatingPointError, match=said):
+        train(script, tmp_path / "run", env_id=env_id, **intervals, **RATES[script])
     for name in ("policy.pt", "best_policy.pt"):
         assert all(weights.isfinite().all() for weights in load_policy(tmp_path / "run" / name).parameters())
     assert all(tensor.isfinite().all() for tensor in checkpoint(tmp_path / "run")["agent"].values())
@@ -279,13 +291,42 @@ def test_frames_that_cannot_be_filmed_cost_a_line(register, tmp_path, capsys):
 
 def test_what_a_terminal_shows(monkeypatch, capsys, register, tmp_path):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    filmed = {}
+
+    def film(path, task, seed, clips, seconds=None):
+        filmed[path.name] = [(policy is None, caption) for policy, caption in clips]
+
+    monkeypatch.setattr(common, "film", film)
     path = train("dqn_cartpole", tmp_path / "run", env_id=register(discrete=True), video=True)
     shown = capsys.readouterr()
     assert "20/20" in shown.err and "return 10" in shown.err  # the progress bar
     for line in (r"step = 20: loss = \S+, steps per second = \d+", r"step = 20: AverageReturn = .*"):
         assert re.search(f"^{line}$", shown.out, re.MULTILINE), shown.out
-    assert {film.name for film in path.glob("*.mp4")} == {"learning.mp4", "trained_agent.mp4", "random_agent.mp4"}
-    assert [step for step, *_ in checkpoint(path)["snapshots"]] == [0, 10]
+    assert filmed == {
+        "trained_agent.mp4": [(False, "")],
+        "random_agent.mp4": [(True, "")],
+        "learning.mp4": [(False, f"{step} updates: return 10.0") for step in (0, 10, 20)],
+    }
+    assert [step for step, *_ in checkpoint(path)["snapshots"]] == [0, 10]  # a longer run goes on from here
+
+
+def test_the_learning_curve(monkeypatch, tmp_path):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kwargs: figures.append(figure))
+    evaluations = [{"step": step, "average_return": step / 10, "std_return": 1.0} for step in (0, 10, 20)]
+    train = [{"step": 10, "loss": 2.0, "mean_q": 3.0}, {"step": 20, "loss": 1.0, "mean_q": 4.0}]
+    tables = {"eval": evaluations, "train": train, "random": [{"average_return": 0.5}]}
+    common.plot_learning_curve(tmp_path / "curve.png", tables, "Mine-v0, seed 0", reward_threshold=5.0)
+    lines = [line.get_ydata() for axes in figures[0].axes for line in axes.lines]
+    assert [list(line) for line in lines if len(line)] == [[0, 1, 2], [0.5, 0.5], [5, 5], [2, 1], [3, 4]]
+
+
+def test_the_formulas_tests_need_no_fork_and_no_signal(monkeypatch):
+    """On Windows, too, conftest.py imports these helpers."""
+    monkeypatch.setattr(multiprocessing, "get_context", None)
+    for module, name in ((signal, "SIGKILL"), (os, "setsid"), (os, "killpg")):
+        monkeypatch.delattr(module, name)
+    runpy.run_path(str(ROOT / "tests" / "runs.py"))
 
 
 def test_output_in_any_encoding(script, monkeypatch):

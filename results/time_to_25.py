@@ -1,7 +1,7 @@
 """How soon the Minitaur runs, in this checkout and another one in turn: a drift of the machine's speed touches both.
 
     git worktree add /tmp/other COMMIT
-    python tests/benchmark.py /tmp/other 400 401 402 | tee until_25.csv  # for these seeds, ten minutes each
+    python results/time_to_25.py /tmp/other 400 401 402 | tee until_25.csv  # for these seeds, ten minutes each
 
 Nothing else should run on the machine. Quote the ratios rather than the seconds.
 """
