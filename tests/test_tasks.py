@@ -104,7 +104,8 @@ def test_arrays_that_a_task_changes_in_place(script, register, tmp_path):
     assert torch.equal(replay["rewards"], next_observations[:, 0]) and not replay["terminated"].any()
     assert observations[:, 0].unique().tolist() == [0, 1, 2, 3] and not observations[observations[:, 0] == 0].any()
     actions = replay["actions"].flatten()
-    torch.testing.assert_close(next_observations[:, 1], 1 + 2 * actions if script == "sac_minitaur" else actions)
+    taken = 1 + 2 * actions if script == "sac_minitaur" else actions.float()
+    torch.testing.assert_close(next_observations[:, 1], taken)
     step = 2 if num_envs else 1
     same_episode = observations[step:, 0] > 0
     assert torch.equal(observations[step:][same_episode], next_observations[:-step][same_episode])
