@@ -1,6 +1,6 @@
 """Soft Actor-Critic teaches the Minitaur, a simulated quadruped, to run.
 
-    python sac_minitaur.py                                    # half an hour on two idle CPU cores, return about 36
+    python sac_minitaur.py                                    # 16 minutes on two idle CPU cores, return about 36
     python sac_minitaur.py --env-id Pendulum-v1 --num-iterations 10000 --initial-collect-steps 1000
     python sac_minitaur.py --resume runs/RUN                  # continues a run that was stopped or killed
     python sac_minitaur.py --evaluate runs/RUN/policy.pt      # evaluates and films a saved policy
