@@ -99,9 +99,8 @@ def read_command_line(script, config_class, tutorial, description):
     first.add_argument("--resume", type=Path)
     first.add_argument("--evaluate", type=Path)
     given, _ = first.parse_known_args()
-    chosen = [f"--{name}" for name, value in vars(given).items() if value]
-    if len(chosen) > 1:
-        raise InputError(f"{' and '.join(chosen)} say different things: give one of them")
+    if sum(bool(value) for value in vars(given).values()) > 1:
+        raise InputError("--tutorial, --resume and --evaluate exclude each other: give one of them")
     if given.resume is not None:
         _, default = read_file(given.resume / "checkpoint.pt", "checkpoint", script, config_class)
     elif given.evaluate is not None:
