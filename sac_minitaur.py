@@ -524,7 +524,7 @@ def train(config, resume=None):
         torch.manual_seed(config.seed)  # the same networks in every process
         agent = SACAgent(config, observation_space, action_space, state_size, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, state_size, math.prod(action_space.shape), run.device)
-        if config.cuda_graph:
+        if config.cuda_graph:  # agent.update then calls these
             agent.update_critics = cuda_graph(agent, agent.update_critics)
             agent.update_actor = cuda_graph(agent, agent.update_actor)
         torch.manual_seed(common.derive_seed(config.seed, rank))  # own actions and batches in every process

@@ -11,16 +11,18 @@ from statistics import median
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).resolve().parent
-# Directory of our runs, and name of the figure → title, the task's threshold, the tutorials' runs.
+# Directory of our runs, and name of the figure → title, the task's threshold, the tutorials' random steps and runs.
 FIGURES = {
     "sac_minitaur": (
         "SAC on the Minitaur",
         15.0,
+        10_000,
         ("sac_minitaur_2018", "sac_minitaur_2021", "sac_minitaur_2023"),
     ),
     "dqn_cartpole": (
         "DQN on CartPole-v0",
         195.0,
+        100,
         ("dqn_cartpole_2021", "dqn_cartpole_2023"),
     ),
 }
@@ -37,8 +39,8 @@ def runs(experiment):
     return dict(sorted((int(path.parent.name.removeprefix("seed")), read(path)) for path in paths))
 
 
-def returns_by_step(rows):
-    return {row["step"]: row["average_return"] for row in rows}
+def returns_by_step(rows, step="step"):
+    return {row[step]: row["average_return"] for row in rows}
 
 
 def tutorials():
@@ -80,6 +82,15 @@ def print_table(experiment, goal, late):
     print(f"| median | {' | '.join(medians)} |")
 
 
+def print_sac_ablation():
+    """The returns at 10 000 updates of seeds 410 to 412, for the default and for the runs without a choice."""
+    print("\n### sac_minitaur, without one choice\n\n| without | median at 10000 | each seed |\n| --- | --- | --- |")
+    names = sorted(path.name for path in (RESULTS / "sac_minitaur_without").glob("*"))
+    for name in ("sac_minitaur", *(f"sac_minitaur_without/{name}" for name in names)):
+        at = [returns_by_step(rows)[10_000] for seed, rows in runs(name).items() if seed in (410, 411, 412)]
+        print(f"| {name.rpartition('/')[2]} | {median(at):.1f} | {', '.join(number(value, 1) for value in at)} |")
+
+
 def print_dqn_ablation(base):
     """How many seeds of `base` and of the runs without a choice reach 200 early, and stay there from 10 000 on."""
     columns = "without | seeds | 200 by 5000 | median first 200 | stay ≥ 195 | worst"
@@ -95,10 +106,10 @@ def print_dqn_ablation(base):
         print(f"| {label} | {len(curves)} | {early} | {number(median(first), 0)} | {stay} | {min(worst):.1f} |")
 
 
-def draw(name, title, threshold, published):
+def draw(name, title, threshold, random_steps, published):
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    at = [returns_by_step(rows) for rows in runs(name).values()]
+    at = [returns_by_step(rows, "env_steps") for rows in runs(name).values()]
     for returns in at:
         axes.plot(list(returns), list(returns.values()), color="C0", linewidth=0.7, alpha=0.6)
     steps = sorted(set.intersection(*map(set, at)))
@@ -107,9 +118,11 @@ def draw(name, title, threshold, published):
     tutorial_curves = tutorials()
     for run, style in zip(published, ("-", ":", "-.")):
         label = f"tutorial, {run.rpartition('_')[2]}"
-        axes.plot(*tutorial_curves[run], color="C1", linestyle=style, linewidth=1, label=label)
+        steps, returns = tutorial_curves[run]  # an environment step for each update
+        steps = [random_steps + step for step in steps]
+        axes.plot(steps, returns, color="C1", linestyle=style, linewidth=1, label=label)
     axes.axhline(threshold, color="green", linestyle="--", linewidth=1, label="the task's threshold")
-    axes.set(title=title, xlabel="gradient updates", ylabel="average return")
+    axes.set(title=title, xlabel="environment steps", ylabel="average return")
     axes.ticklabel_format(style="plain")
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     figure.savefig(RESULTS / f"{name}.png", dpi=110)
@@ -127,6 +140,7 @@ def main():
             print_table(name, goal=3_000, late=50_000)
         elif "sac" in name:
             print_table(name, goal=15, late=50_000)
+    print_sac_ablation()
     print_dqn_ablation("dqn_cartpole")
     for name, figure in FIGURES.items():
         draw(name, *figure)
