@@ -347,9 +347,12 @@ def worker_pool(size, method):
     try:
         yield pool
     finally:
-        for process in set(multiprocessing.active_children()) - children_before:
+        started = set(multiprocessing.active_children()) - children_before
+        for process in started:
             process.kill()
         pool.shutdown(cancel_futures=True)
+        for process in started:
+            process.join()
 
 
 def prepare_worker():
