@@ -506,6 +506,14 @@ def plot_learning_curve(path, tables, title, reward_threshold):
 # A training run
 
 
+def cpu_copy(policy, weights=None):
+    """A copy of the policy for the CPU, with other weights if they are given."""
+    policy = copy.deepcopy(policy).cpu().eval()
+    if weights is not None:
+        policy.load_state_dict(weights)
+    return policy
+
+
 def replay_tensors(buffer):
     """The tensors of a script's `ReplayBuffer`, by name: each has a row, (capacity, …), for a transition."""
     return {name: value for name, value in vars(buffer).items() if torch.is_tensor(value)}
@@ -700,23 +708,17 @@ class Run:
             dist.gather_object(own, processes)  # fills process 0's list
         if self.rank:
             return
-        require_finite(self.agent.state_dict(), step)
+        agent = self.agent.state_dict()
+        require_finite(agent, step)
         state = {name: getattr(self, name) for name in self.SAVED}
         state |= {"step": step, "seconds": time.perf_counter() - self.started, "processes": processes}
-        state |= {"agent": self.agent.state_dict(), "optimizers": [each.state_dict() for each in self.agent.optimizers]}
-        self._write("policy.pt", "policy", {"weights": self._cpu_policy().state_dict()})
+        state |= {"agent": agent, "optimizers": [each.state_dict() for each in self.agent.optimizers]}
+        self._write("policy.pt", "policy", {"weights": cpu_copy(self.agent.policy).state_dict()})
         self._write("checkpoint.pt", "checkpoint", state)
 
     def _write(self, name, kind, state):
         head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": self.plain_config}
         write_atomically(self.path / name, lambda file: torch.save(head | state, file))
-
-    def _cpu_policy(self, weights=None):
-        """A copy of the policy for the CPU, with other weights if they are given."""
-        policy = copy.deepcopy(self.agent.policy).cpu().eval()
-        if weights is not None:
-            policy.load_state_dict(weights)
-        return policy
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
@@ -756,7 +758,7 @@ class Run:
         if self.rank or (rows and rows[-1]["step"] == step):
             return
         if policy:
-            policy = copy.deepcopy(policy).cpu().eval()
+            policy = cpu_copy(policy)
         call = (evaluate_in_worker, self.evaluate_episode, pickle.dumps(policy), self.pickled_task)
         episodes = [self.pool.submit(*call, seed) for seed in evaluation_seeds(self.config)]
         while futures.wait(episodes, timeout=0.1).not_done and not self.stop_request.is_set():
@@ -806,8 +808,8 @@ class Run:
         if self.config.video:
             self._film()
         with or_warn("exported policies"):
-            export_policy(self.path / "policy.pt2", self._cpu_policy(), observation_shape)
-            export_policy(self.path / "best_policy.pt2", self._cpu_policy(self.best[1]), observation_shape)
+            export_policy(self.path / "policy.pt2", cpu_copy(self.agent.policy), observation_shape)
+            export_policy(self.path / "best_policy.pt2", cpu_copy(self.agent.policy, self.best[1]), observation_shape)
         files = sorted(path.name for path in self.path.iterdir())
         say(f"finished; {self.path} holds {', '.join(files)}")
 
@@ -820,8 +822,8 @@ class Run:
         seed = evaluation_seeds(self.config)[0]
         learning = []
         for step, average_return, weights in self.snapshots:
-            learning.append((self._cpu_policy(weights), f"{step} updates: return {average_return:.1f}"))
+            learning.append((cpu_copy(self.agent.policy, weights), f"{step} updates: return {average_return:.1f}"))
         with or_warn("film"):
-            film(self.path / "trained_agent.mp4", self.task, seed, [(self._cpu_policy(), "")])
+            film(self.path / "trained_agent.mp4", self.task, seed, [(cpu_copy(self.agent.policy), "")])
             film(self.path / "random_agent.mp4", self.task, seed, [(None, "")])
             film(self.path / "learning.mp4", self.task, seed, learning, seconds=4)

@@ -6,7 +6,6 @@
 Nothing else should run on the machine. Quote the ratios rather than the seconds.
 """
 
-import csv
 import signal
 import subprocess
 import sys
@@ -14,17 +13,11 @@ import tempfile
 import time
 from pathlib import Path
 
+from report import read
+
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = 25  # the return of a Minitaur that runs
 FLAGS = "--no-video --eval-interval 2500 --log-interval 2500 --num-eval-episodes 10".split()
-
-
-def rows(path):
-    """The rows of a CSV as dicts of numbers; none before the file is there."""
-    if not path.exists():
-        return []
-    with open(path) as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 def until_it_runs(checkout, run_dir, seed):
@@ -37,11 +30,12 @@ def until_it_runs(checkout, run_dir, seed):
         if process.poll() is not None:
             sys.exit(f"seed {seed} never reached {RUNS} in {checkout}")
         time.sleep(0.2)
-        evaluations = rows(run_dir / "eval.csv")
+        if (run_dir / "eval.csv").exists():
+            evaluations = read(run_dir / "eval.csv")
     seconds = time.perf_counter() - begin
     process.send_signal(signal.SIGTERM)
     process.wait()
-    trained = {row["step"]: row["seconds"] for row in rows(run_dir / "train.csv")}
+    trained = {row["step"]: row["seconds"] for row in read(run_dir / "train.csv")}
     evaluating = [row["seconds"] - trained[row["step"]] for row in evaluations if row["step"] in trained]
     return seconds - sum(evaluating)
 

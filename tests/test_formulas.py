@@ -92,6 +92,17 @@ def test_dqn_update(tutorial):
         torch.testing.assert_close(target, 0.75 * target_before + 0.25 * after.detach())
 
 
+def test_dqn_learning_rate():
+    """It is half after 2 updates with a decay of 2, a tenth after 6, and stays as it is without."""
+    for decay, expected in ((2, [0.01, 0.005, 0.001]), (None, 3 * [0.01])):
+        agent = dqn_agent(learning_rate=0.01, learning_rate_decay=decay)
+        rates = []
+        for step in (0, 2, 6):
+            agent.update(dqn_batch(), step)
+            rates.append(agent.optimizer.param_groups[0]["lr"])
+        assert rates == pytest.approx(expected)
+
+
 def test_dqn_starts_as_the_tutorials_network():
     torch.manual_seed(0)
     first, _, second, _, last = QNetwork(400, 2, (500, 300)).net

@@ -213,6 +213,9 @@ def test_a_seed_fixes_the_episode(env):
     with gym.make(ENV_ID) as fresh:
         assert rollout(fresh, seed=7) == used and fresh.unwrapped.dynamics == dynamics
     assert rollout(env, seed=8) != used
+    # An unseeded reset goes on drawing from the same generator.
+    env.reset()
+    assert env.unwrapped.dynamics not in (dynamics, None)
 
 
 def test_dynamics_can_be_given(env):
@@ -273,12 +276,14 @@ def test_passes_gymnasiums_check():
 
 
 def test_any_program_can_make_it(tmp_path):
-    """Another process gives the same bits."""
+    """Another process gives the same bits. It may end while it holds the environment in a circle of references."""
     code = f"""
-import gymnasium
+import gymnasium, types
 env = gymnasium.make("sac_minitaur:{ENV_ID}")
 observation, _ = env.reset(seed=7)
 print(env.spec.max_episode_steps, observation.tobytes().hex(), env.unwrapped.dynamics.base_mass)
+keep = types.SimpleNamespace(env=env)
+keep.itself = keep
 """
     process = run_python(tmp_path, "-c", code)
     with gym.make(ENV_ID) as env:

@@ -126,6 +126,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
         if "evaluation" in name and status == 130:
             assert f"stopped at step {name.split()[-1]}" in run.stdout
     assert not list(run_dir.glob("*.mp4"))
+    (run_dir / "notes.csv").write_text("a student's own\n")
     (run_dir / ".tmp-1-checkpoint.pt").write_text("left by a kill")
     (run_dir / "best_policy.pt").write_bytes((run_dir / "policy.pt").read_bytes())  # of after the checkpoint
     # The real command, in a new interpreter, from another directory. The run knows that it was raised.
@@ -134,7 +135,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
     assert_tensorboard_once(run_dir)
     assert json.loads((run_dir / "config.json").read_text())["num_iterations"] == 300
     assert len(list(run_dir.glob("*.mp4"))) == 3
-    assert not list(run_dir.glob(".tmp-*"))
+    assert (run_dir / "notes.csv").exists() and not list(run_dir.glob(".tmp-*"))
     seconds = [row["seconds"] for row in read_csv(run_dir / "train.csv")]
     assert seconds == sorted(seconds)
 
