@@ -3,7 +3,6 @@
 One class belongs to the learning itself: `ObservationScaling`, a part of both policies.
 """
 
-import argparse
 import atexit
 import contextlib
 import copy
@@ -12,6 +11,7 @@ import dataclasses
 import functools
 import gc
 import io
+import json
 import math
 import multiprocessing
 import os
@@ -32,8 +32,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 import tyro
-from pydantic import ConfigDict, Field
-from pydantic_core import to_json, to_jsonable_python
+from pydantic import ConfigDict, Field, PositiveInt
 from tqdm import tqdm
 
 FILE_FORMAT = 5  # of checkpoints and policies
@@ -45,9 +44,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Task = Annotated[str, Field(pattern=r"^(\w[\w.]*:)?[^:]+$")]  # CartPole-v1, or my_module:MyTask-v0
-Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:[1-9]?\d)?)$")]
-Count = Annotated[int, Field(ge=1, le=1024)]  # of environments, of threads
-Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
+Layers = tuple[PositiveInt, ...]
 
 
 class InputError(Exception):
@@ -58,7 +55,7 @@ def run_main(main):
     """Calls `main` as a script does: an InputError becomes one line and exit status 2, Ctrl-C exit status 130."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's have not
-            stream.reconfigure(errors="replace")  # a console without an α shows a question mark
+            stream.reconfigure(errors="replace", line_buffering=True)  # a console without an α shows a question mark
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
     try:
@@ -74,12 +71,6 @@ def run_main(main):
     sys.exit(status)
 
 
-def say(line):
-    """Prints a line, above the progress bar."""
-    tqdm.write(line)
-    sys.stdout.flush()
-
-
 def one_line(error):
     """An exception's message in one line, or its type where it has none."""
     return " ".join(str(error).split())[:200] or type(error).__name__
@@ -88,18 +79,23 @@ def one_line(error):
 # The command line
 
 
+@dataclasses.dataclass
+class Source:
+    """Where the defaults of the other flags come from: `Config`, or one of these."""
+
+    tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
+    resume: Path | None = None  # directory of a run to continue from its last checkpoint
+    evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
+
+
 def read_command_line(script, config_class, tutorial, description):
     """The config, --resume's directory or None, and --evaluate's file or None. Raises InputError.
 
-    It is read twice. The first reading looks for --tutorial, --resume and --evaluate alone. They choose the defaults of
-    all other flags: `tutorial`, a dict, or a saved run's or policy's config.
+    It is read twice. The first reading looks for a `Source` alone, and so for the defaults: `tutorial`, a dict, or the
+    config of a saved run or policy.
     """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--tutorial", action=argparse.BooleanOptionalAction)
-    first.add_argument("--resume", type=Path)
-    first.add_argument("--evaluate", type=Path)
-    given, _ = first.parse_known_args()
-    if sum(bool(value) for value in vars(given).values()) > 1:
+    given, _ = tyro.cli(Source, return_unknown_args=True, add_help=False)
+    if sum(map(bool, (given.tutorial, given.resume, given.evaluate))) > 1:
         raise InputError("--tutorial, --resume and --evaluate exclude each other: give one of them")
     if given.resume is not None:
         _, default = read_file(given.resume / "checkpoint.pt", "checkpoint", script, config_class)
@@ -110,13 +106,10 @@ def read_command_line(script, config_class, tutorial, description):
         default = config_class(**tutorial) if given.tutorial else config_class()
 
     @dataclasses.dataclass
-    class Command:
-        config: tyro.conf.OmitArgPrefixes[config_class]
-        tutorial: bool = False  # set every value marked "ours" back to the tutorials'; other flags override it
-        resume: Path | None = None  # directory of a run to continue from its last checkpoint
-        evaluate: Path | None = None  # a run's policy.pt to evaluate and film instead of training
+    class Command(Source):
+        config: tyro.conf.OmitArgPrefixes[config_class] = default
 
-    command = tyro.cli(Command, default=Command(default), description=description)
+    command = tyro.cli(Command, description=description)
     return command.config, command.resume, command.evaluate
 
 
@@ -147,12 +140,13 @@ def continued(config, resume, script):
 # Files
 
 
-def write_atomically(path, write):
-    """Lets `write(file)` fill a temporary file, then renames it: a kill leaves the old file or the new one."""
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+@contextlib.contextmanager
+def whole_file(path):
+    """Opens a temporary file, and renames it when it is written: a kill leaves the old file or the new one."""
+    temporary = path.with_name(f".tmp-{path.name}")
     try:
         with open(temporary, "wb") as file:
-            write(file)
+            yield file
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -180,7 +174,8 @@ def export_policy(path, policy, observation_shape):
     """Writes `policy`, for any batch size, so that `torch.export.load(path).module()` needs none of our code."""
     batch = torch.zeros((2, *observation_shape))
     program = torch.export.export(policy, (batch,), dynamic_shapes=({0: torch.export.Dim("batch")},))
-    write_atomically(path, lambda file: torch.export.save(program, file))
+    with whole_file(path) as file:
+        torch.export.save(program, file)
 
 
 # Tasks, seeds, devices
@@ -203,20 +198,22 @@ def find_task(config, needed, training=True):
     name = f"--env-id {config.env_id}"
     try:
         env = gym.make(config.env_id, max_episode_steps=config.max_episode_steps)
-    except (gym.error.Error, ImportError) as error:
+    except gym.error.Error as error:
         hint = "a package's task is written package:Task-v0, as highway_env:highway-v0"
         raise InputError(f"{name} cannot be made: {one_line(error)} ({hint})") from None
+    except ImportError as error:
+        raise InputError(f"{name} cannot be made: {one_line(error)}") from None
     with env:
         require_spaces(name, env.observation_space, env.action_space, needed)
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
-                say(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
+                tqdm.write(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
         limit = env.spec.max_episode_steps  # the flag's, if there is one
         task = gym.spec(env.unwrapped.spec.id)  # env.spec lists the task's own wrappers, which gym.make may refuse
     if training and limit and limit > config.checkpoint_interval * config.collect_steps_per_iteration:
         what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {limit} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
-    task = dataclasses.replace(task, max_episode_steps=limit or 10_000)
+    task = dataclasses.replace(task, max_episode_steps=limit or 1_000)
     return task, env.observation_space, env.action_space
 
 
@@ -290,12 +287,10 @@ def select_device(name):
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda":
         name = "cuda:" + os.environ.get("LOCAL_RANK", "0")
-    device = torch.device(name)
     try:
-        torch.empty(1, device=device)
+        return torch.empty(1, device=name).device
     except (AssertionError, RuntimeError) as error:
-        raise InputError(f"--device {device} cannot be used ({one_line(error)}): use --device cpu") from None
-    return device
+        raise InputError(f"--device {name} cannot be used ({one_line(error)}): use --device cpu") from None
 
 
 # Processes
@@ -340,7 +335,7 @@ def worker_pool(size, method):
     """A pool of `size` processes. At the end it kills all that began since, also SAC's environments after an error."""
     children_before = set(multiprocessing.active_children())
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # new processes inherit it, until `prepare_worker`
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # new processes inherit it
     for _ in range(size):
         pool.submit(int)  # so that all processes start now
     signal.signal(signal.SIGINT, handler)
@@ -403,9 +398,14 @@ def summarize(results):
     return row, text.format_map(row)
 
 
-def evaluate_file(path, script, config, policy, task, evaluate):
-    """What --evaluate PATH does: plays the episodes that its run was evaluated with, tells the returns, films one."""
+def evaluate_file(path, script, config, policy_class, needed, evaluate):
+    """What --evaluate PATH does: plays the episodes that its run was evaluated with, tells the returns, films one.
+
+    `needed` is the kind of action space: see `find_task`. Raises InputError for a file that does not fit.
+    """
     state, _ = read_file(path, "policy", script, type(config))
+    task, observation_space, action_space = find_task(config, needed, training=False)
+    policy = policy_class(config, observation_space, action_space)
     try:
         policy.load_state_dict(state["weights"])
     except RuntimeError:
@@ -415,12 +415,12 @@ def evaluate_file(path, script, config, policy, task, evaluate):
     seeds = evaluation_seeds(config)
     with gym.make(task) as env:
         _, text = summarize([evaluate(policy, env, seed) for seed in tqdm(seeds, disable=None)])
-    say(f"{path}: {text}")
+    tqdm.write(f"{path}: {text}")
     if config.video:
         video = path.with_suffix(".mp4")
         with or_warn("film"):
             film(video, task, seeds[0], [(policy, "")])
-            say(f"filmed one episode: {video}")
+            tqdm.write(f"filmed one episode: {video}")
 
 
 @contextlib.contextmanager
@@ -429,25 +429,21 @@ def or_warn(what):
     try:
         yield
     except Exception as error:
-        say(f"warning: no {what} ({one_line(error)})")
+        tqdm.write(f"warning: no {what} ({one_line(error)})")
 
 
 def film(path, task, seed, clips, seconds=math.inf):
     """Films the first `seconds` of an episode, in real time, for each of `clips`: a policy or None, and a caption."""
     import imageio  # here: it takes a moment
 
-    with gym.make(task, render_mode="rgb_array") as env:
+    with gym.make(task, render_mode="rgb_array") as env, whole_file(path) as file:
         rate = env.metadata.get("render_fps") or 30
         skip = math.ceil(rate / 50)  # at most 50 frames a second
         options = {"fps": rate / skip, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
-
-        def write(file):
-            with imageio.get_writer(file.name, **options) as video:  # ffmpeg opens it by its name
-                for policy, caption in clips:
-                    for frame in frames(env, policy, seed, skip, seconds * rate):
-                        video.append_data(with_caption(frame, caption))
-
-        write_atomically(path, write)
+        with imageio.get_writer(file.name, **options) as video:  # ffmpeg opens it by its name
+            for policy, caption in clips:
+                for frame in frames(env, policy, seed, skip, seconds * rate):
+                    video.append_data(with_caption(frame, caption))
 
 
 def frames(env, policy, seed, skip, max_steps):
@@ -500,7 +496,8 @@ def plot_learning_curve(path, tables, title, reward_threshold):
         axes.plot([row["step"] for row in rows], [row[name] for row in rows])
     losses.set(title="loss", xlabel="gradient updates", yscale="log")
     values.set(title="mean Q", xlabel="gradient updates")
-    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=100))
+    with whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=100)
 
 
 # A training run
@@ -555,21 +552,19 @@ def stop_signals():
     """Yields an event that Ctrl-C and SIGTERM set. A second Ctrl-C raises KeyboardInterrupt at once."""
     requested = threading.Event()
 
-    def request_stop(number, _):
-        if not requested.is_set():
-            requested.set()
-            # Not print: the signal may have interrupted one.
-            os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
-        elif number == signal.SIGINT:
-            raise KeyboardInterrupt
+    def request_stop(*_):
+        requested.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        # Not print: the signal may have interrupted one.
+        os.write(2, b"\nstopping: saving a checkpoint first (Ctrl-C again stops at once)\n")
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.signal(number, request_stop) for number in numbers]
+    on_interrupt = signal.signal(signal.SIGINT, request_stop)
+    on_terminate = signal.signal(signal.SIGTERM, request_stop)
     try:
         yield requested
     finally:
-        for number, handler in zip(numbers, handlers):
-            signal.signal(number, handler)
+        signal.signal(signal.SIGINT, on_interrupt)
+        signal.signal(signal.SIGTERM, on_terminate)
 
 
 class TableWriter:
@@ -581,7 +576,7 @@ class TableWriter:
         for events in path.glob("events.out.tfevents.*"):
             events.unlink()  # left before a resume: they may have rows of after the checkpoint
         self.path = path
-        self.tables = tables
+        self.tables = tables  # the run's own lists: `add` extends them
         self.board = SummaryWriter(path)
         for table, rows in tables.items():
             for row in rows:
@@ -593,10 +588,12 @@ class TableWriter:
         rows.append(row)
         self._show(table, row)
         text = io.StringIO()
-        writer = csv.DictWriter(text, rows[0], extrasaction="ignore", lineterminator="\n")
+        columns = list(rows[0])
+        writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-        write_atomically(self.path / f"{table}.csv", lambda file: file.write(text.getvalue().encode()))
+        with whole_file(self.path / f"{table}.csv") as file:
+            file.write(text.getvalue().encode())
 
     def _show(self, table, row):
         for column, value in row.items():
@@ -613,19 +610,20 @@ class Run:
 
     SAVED = ("env_steps", "finished", "metrics", "best", "snapshots", "tables")  # by `save`, for `_restore`
 
-    def __init__(self, script, config, evaluate, processes=(0, 1)):
+    def __init__(self, script, config, evaluate, rank=0, world_size=1):
         """Raises InputError for a config that cannot be used. Nothing is written yet."""
         self.script = script
         self.config = config
-        self.evaluate_episode = evaluate
-        self.rank, self.world_size = processes
+        self.play_episode = evaluate
+        self.rank = rank
+        self.world_size = world_size
         self.device = select_device(config.device)
         if config.batch_size % self.world_size:
             raise InputError(f"--batch-size {config.batch_size} cannot be shared by {self.world_size} processes")
         name = f"{script}-{datetime.now():%Y%m%d-%H%M%S-%f}-seed{config.seed}"  # %f: runs may start at once
         self.path = Path(config.run_dir or Path("runs") / name)
-        # The config as plain values for files. The directory is not among them: a run may be moved.
-        self.plain_config = to_jsonable_python(dataclasses.asdict(config) | {"run_dir": None})
+        # The config as a dict, for files. The directory is not in it: a run may be moved.
+        self.plain_config = dataclasses.asdict(config) | {"run_dir": None}
         self.env_steps = 0
         self.finished = []  # returns and lengths of the last ten training episodes that ended
         self.metrics = {}  # the latest of each: an update may not return all
@@ -661,8 +659,9 @@ class Run:
         if self.rank == 0:
             self._begin_files(new=checkpoint is None)
             limit = self.task.max_episode_steps
-            say(f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps, on {self.device}")
-            say(f"run directory {self.path}")
+            task = f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps"
+            tqdm.write(f"{task}, on {self.device}")
+            tqdm.write(f"run directory {self.path}")
         if not checkpoint:
             self.save(step)  # from here on --resume continues the run
         self.evaluate(0, policy=None)
@@ -691,10 +690,8 @@ class Run:
             except (OSError, ValueError) as error:
                 what = f"--run-dir {self.path} cannot be made ({one_line(error)})"
                 raise InputError(f"{what}: name a new directory") from None
-        text = to_json(self.plain_config, indent=2) + b"\n"
-        write_atomically(self.path / "config.json", lambda file: file.write(text))
-        for path in self.path.glob(".tmp-*"):
-            path.unlink()  # left by a kill
+        with whole_file(self.path / "config.json") as file:
+            file.write(json.dumps(self.plain_config, indent=2).encode())
         if self.best[1] is not None:  # after a resume: the file may have weights of after the checkpoint
             self._write("best_policy.pt", "policy", {"weights": self.best[1]})
         self.writer = TableWriter(self.path, self.tables)
@@ -718,7 +715,8 @@ class Run:
 
     def _write(self, name, kind, state):
         head = {"kind": kind, "script": self.script, "format": FILE_FORMAT, "config": self.plain_config}
-        write_atomically(self.path / name, lambda file: torch.save(head | state, file))
+        with whole_file(self.path / name) as file:
+            torch.save(head | state, file)
 
     def log_episode(self, episode_return, length):
         """Notes a training episode that has ended."""
@@ -737,12 +735,12 @@ class Run:
         values = {name: float(value) for name, value in self.metrics.items()}
         last_step, then = self.last_logged
         self.last_logged = (step, time.perf_counter())
-        speed = (step - last_step) / (time.perf_counter() - then)
+        speed = (step - last_step) / (time.perf_counter() - then)  # evaluations and checkpoints included
         mean_return, mean_length = np.mean(self.finished or [(math.nan, math.nan)], axis=0).tolist()
         episodes = {"collect_return": mean_return, "collect_episode_length": mean_length}
         self._add_row("train", step, {"steps_per_second": speed} | episodes | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
-        say(f"step = {step}: {losses}, steps per second = {speed:.0f}")
+        tqdm.write(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
     def _add_row(self, table, step, values):
         seconds = round(time.perf_counter() - self.started, 3)
@@ -759,15 +757,16 @@ class Run:
             return
         if policy:
             policy = cpu_copy(policy)
-        call = (evaluate_in_worker, self.evaluate_episode, pickle.dumps(policy), self.pickled_task)
+        call = (evaluate_in_worker, self.play_episode, pickle.dumps(policy), self.pickled_task)
         episodes = [self.pool.submit(*call, seed) for seed in evaluation_seeds(self.config)]
-        while futures.wait(episodes, timeout=0.1).not_done and not self.stop_request.is_set():
-            pass
+        waiting = episodes
+        while waiting and not self.stop_request.is_set():
+            waiting = futures.wait(episodes, timeout=0.1).not_done
         if self.stop_request.is_set():
             return
         row, text = summarize([episode.result() for episode in episodes])
         self._add_row(table, step, row)
-        say(f"step = {step}: {text}" if policy else f"random policy: {text}")
+        tqdm.write(f"step = {step}: {text}" if policy else f"random policy: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             require_finite(policy.state_dict(), step)
@@ -785,14 +784,15 @@ class Run:
     def stop_if_requested(self, step):
         """After Ctrl-C or SIGTERM: saves a checkpoint, tells how to continue, and raises KeyboardInterrupt."""
         requested = torch.tensor(float(self.stop_request.is_set()))
-        average([requested])  # torchrun's processes stop together
-        if not requested:
+        average([requested])  # above 0 where any of torchrun's processes is to stop: then all do, together
+        if requested == 0:
             return
         self.save(step)
         if self.rank == 0:
             self.progress.close()
             self._plot()
-            say(f"stopped at step {step}; to continue: --resume '{self.path}' (in Python: resume={str(self.path)!r})")
+            how = f"--resume '{self.path}' (in Python: resume={str(self.path)!r})"
+            tqdm.write(f"stopped at step {step}; to continue: {how}")
         raise KeyboardInterrupt
 
     def finish(self, step, observation_shape):
@@ -802,7 +802,8 @@ class Run:
         self.stop_if_requested(step)
         if self.rank:
             return
-        self.stop_request.set()  # all is saved: from here on Ctrl-C stops at once
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # all is saved: both signals now stop at once
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         self.progress.close()
         self._plot()
         if self.config.video:
@@ -811,14 +812,14 @@ class Run:
             export_policy(self.path / "policy.pt2", cpu_copy(self.agent.policy), observation_shape)
             export_policy(self.path / "best_policy.pt2", cpu_copy(self.agent.policy, self.best[1]), observation_shape)
         files = sorted(path.name for path in self.path.iterdir())
-        say(f"finished; {self.path} holds {', '.join(files)}")
+        tqdm.write(f"finished; {self.path} holds {', '.join(files)}")
 
     def _plot(self):
         title = f"{self.config.env_id}, seed {self.config.seed}"
         plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
 
     def _film(self):
-        say("filming the trained agent, a random one, and how it learned ...")
+        tqdm.write("filming the trained agent, a random one, and how it learned ...")
         seed = evaluation_seeds(self.config)[0]
         learning = []
         for step, average_return, weights in self.snapshots:

@@ -29,7 +29,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import NonNegativeFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, PositiveInt
 from pydantic.dataclasses import dataclass
 from torch import nn
 from torch.nn import functional as F
@@ -45,7 +45,7 @@ class Config:
     """Deep Q-learning on CartPole. Values are the tutorial's unless a line says "ours"."""
 
     env_id: common.Task = "CartPole-v0"  # a gymnasium task with a Discrete action space
-    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
+    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 1 000 where it has none)
     num_iterations: PositiveInt = 20_000  # gradient updates
     initial_collect_steps: PositiveInt = 100  # random steps before the first update
     collect_steps_per_iteration: PositiveInt = 1  # environment steps for each update
@@ -59,26 +59,20 @@ class Config:
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     time_limit_terminates: bool = False  # ours (theirs: yes, in 2023): a time limit counts as an end of the task
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, so no slow copy): Q̄ ← Q̄ + τ (Q − Q̄), in the weights
-    value_unit: bool = True  # ours (theirs: no): learn Q in units of about 1 / (1 − γ): see `fit_scaling`
+    value_unit: bool = True  # ours (theirs: no): learn Q in units of 1 / (1 − γ), if γ < 1: see `fit_scaling`
     advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): widens the gap to worse actions: see `update`
     observation_scaling: bool = True  # ours (theirs: no): bring observations near [-1, 1]: `common.ObservationScaling`
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
 
     seed: common.Seed = 0  # source of all randomness
-    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Count = 1  # CPU threads of the update; more gain nothing here
+    device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: PositiveInt = 1  # CPU threads of the update; more gain nothing here
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 200  # updates between rows of train.csv
     eval_interval: PositiveInt = 1_000  # updates between evaluations
     num_eval_episodes: PositiveInt = 10  # episodes in each evaluation
     checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode: see `train`
-
-    @model_validator(mode="after")
-    def _finite_value(self):
-        if self.value_unit and self.gamma == 1:
-            raise ValueError("--value-unit divides by 1 − gamma: use a --gamma below 1, or --no-value-unit")
-        return self
 
 
 TUTORIAL = {
@@ -146,7 +140,7 @@ class Policy(nn.Module):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device. Actions are numbered from 0, all else is float32.
 
-    `terminated` is 1 only where the task itself ended. After a time limit (`truncated`) it is 0: rewards would follow.
+    `terminated` is 1 where the task itself ended. After a time limit (`truncated`) it is 0: rewards would follow.
     """
 
     def __init__(self, capacity, observation_size, device):
@@ -173,13 +167,7 @@ class ReplayBuffer:
     def sample(self, batch_size, generator):
         """A batch drawn uniformly with replacement: (B, O), (B,) of int64, (B,), (B,), (B, O)."""
         i = torch.randint(self.size, (batch_size,), generator=generator).to(self.rewards.device)
-        return (
-            self.observations[i],
-            self.actions[i],
-            self.rewards[i],
-            self.terminated[i],
-            self.next_observations[i],
-        )
+        return self.observations[i], self.actions[i], self.rewards[i], self.terminated[i], self.next_observations[i]
 
 
 def td_targets(rewards, terminated, next_q, gamma):
@@ -204,7 +192,7 @@ class DQNAgent(nn.Module):
         self.generator = torch.Generator()  # of actions and batches. A task may use PyTorch's global one
         self.generator.manual_seed(config.seed)
         self.policy = Policy(config, observation_space, action_space)
-        self.scaling = self.policy.scaling
+        self.scaling = self.policy.scaling  # the same module, not a copy. So is the network
         self.q_network = self.policy.q_network
         self.target_network = copy.deepcopy(self.q_network).requires_grad_(False)
         self.register_buffer("value_offset", torch.tensor(0.0))  # Q = offset + scale × output
@@ -216,23 +204,23 @@ class DQNAgent(nn.Module):
         self.optimizers = [self.optimizer]  # a checkpoint saves them
 
     def get_extra_state(self):
-        """The generator's state, which `state_dict` adds to the weights: so a checkpoint has it."""
+        """The generator's state. `state_dict` adds it to the weights: so a checkpoint has it."""
         return self.generator.get_state()
 
     def set_extra_state(self, state):
-        """What `load_state_dict` does with it."""
+        """Restores the generator, when `load_state_dict` finds its state."""
         self.generator.set_state(state)
 
     def fit_scaling(self, observations, rewards):
         """Fits the scales to observations (N, O) and rewards (N,) of random actions.
 
-        So the network learns numbers of size 1, not 100. Output 0 then stands for the Q of an episode that never ends
-        and earns the mean reward: mean reward / (1 − γ). CartPole's rewards are 1: with γ = 0.99, Q = 100 + 100 ×
-        output, and output −1 stands for no more reward. If all rewards were 0, Q stays the output.
+        Q = (mean r + mean |r| × output) / (1 − γ), so the network learns numbers of size 1, not 100. Output 0 stands
+        for an episode that never ends and earns the mean reward. CartPole's rewards are 1: with γ = 0.99, Q = 100 +
+        100 × output, and output −1 stands for no more reward. If all rewards were 0, Q stays the output.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations)
-        if self.config.value_unit and rewards.any():
+        if self.config.value_unit and self.config.gamma < 1 and rewards.any():
             horizon = 1 / (1 - self.config.gamma)
             self.value_offset.copy_(rewards.mean() * horizon)
             self.value_scale.copy_(rewards.abs().mean() * horizon)
@@ -268,10 +256,9 @@ class DQNAgent(nn.Module):
         with torch.no_grad():
             next_q = self.q_values(self.target_network, next_s)  # Q̄(s', ·): (B, A)
             y = td_targets(rewards, terminated, next_q, config.gamma)  # (B,)
-            if config.advantage_learning:  # ours: lowers the targets of worse actions: errors seldom let one seem best
-                # The best action's gap is 0, so max Q keeps its meaning.
+            if config.advantage_learning:  # ours: y ← y − β (max Q̄(s, ·) − Q̄(s, a)): a worse action looks clearly worse
                 target_q = self.q_values(self.target_network, s)  # Q̄(s, ·): (B, A)
-                y = y - config.advantage_learning * gap_to_best(target_q, a)
+                y = y - config.advantage_learning * gap_to_best(target_q, a)  # (B,). The best action's gap is 0
         q = self.q_values(self.q_network, s).gather(1, a[:, None]).squeeze(1)  # Q(s, a): (B,)
         loss = F.mse_loss(q, y)
 
@@ -321,11 +308,11 @@ def collect_step(env, observation, action, buffer, run):
 def train(config, resume=None):
     """Trains as `config` says and returns the run directory's path.
 
-    With `resume`, a run's directory, that run continues: `common.continued` says what is then taken from `config`.
-    Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
+    `resume` is the directory of a run that continues: see `common.continued`. Raises InputError for what cannot be
+    used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "dqn_cartpole")
-    with common.Run("dqn_cartpole", config, evaluate) as run:  # its evaluations call `evaluate`
+    with common.Run("dqn_cartpole", config, evaluate) as run:  # starts processes that will call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # task: a gymnasium spec
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
         env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later
@@ -367,10 +354,8 @@ def main():
     config, resume, policy_file = common.read_command_line("dqn_cartpole", Config, TUTORIAL, __doc__)
     if policy_file is None:
         train(config, resume)
-        return
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete, training=False)
-    policy = Policy(config, observation_space, action_space)
-    common.evaluate_file(policy_file, "dqn_cartpole", config, policy, task, evaluate)
+    else:
+        common.evaluate_file(policy_file, "dqn_cartpole", config, Policy, gym.spaces.Discrete, evaluate)
 
 
 if __name__ == "__main__":

@@ -46,11 +46,11 @@ class Config:
     """Soft Actor-Critic on the Minitaur. Values are the tutorials' of 2021 and 2023 unless a line says "ours"."""
 
     env_id: common.Task = "MinitaurBulletEnv-v0"  # a gymnasium task with a bounded Box action space
-    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 10 000 where it has none)
+    max_episode_steps: PositiveInt | None = None  # time limit (default: the task's own, or 1 000 where it has none)
     num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, of all environments together
     collect_steps_per_iteration: PositiveInt = 1  # steps of each environment for each update
-    num_envs: common.Count = 4  # ours (theirs: 1): environments at once, each in a worker process
+    num_envs: PositiveInt = 4  # ours (theirs: 1): environments at once, each in a worker process
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
     actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): actor and α move in every third update
@@ -76,8 +76,8 @@ class Config:
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
 
     seed: common.Seed = 0  # source of all randomness
-    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: common.Count = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
+    device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: PositiveInt = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
     cuda_graph: bool = False  # on a GPU: record the update once and repeat it, about twice as fast: see `cuda_graph`
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     video: bool = True  # film the trained agent, a random one, and the progress between
@@ -204,7 +204,7 @@ def to_bounds(action, low, high):
 class ReplayBuffer:
     """The last `capacity` transitions, on the training device, in float32.
 
-    `terminated` is 1 only where the task itself ended. After a time limit it is 0: more reward would have followed.
+    `terminated` is 1 where the task itself ended. After a time limit (`truncated`) it is 0: rewards would follow.
     """
 
     def __init__(self, capacity, state_size, action_size, device):
@@ -232,14 +232,8 @@ class ReplayBuffer:
 
     def sample(self, batch_size):
         """A batch drawn uniformly with replacement: (B, S), (B, A), (B,), (B,), (B, S)."""
-        rows = torch.randint(self.size, (batch_size,), device=self.rewards.device)
-        return (
-            self.observations[rows],
-            self.actions[rows],
-            self.rewards[rows],
-            self.terminated[rows],
-            self.next_observations[rows],
-        )
+        i = torch.randint(self.size, (batch_size,), device=self.rewards.device)
+        return self.observations[i], self.actions[i], self.rewards[i], self.terminated[i], self.next_observations[i]
 
 
 def td_targets(rewards, terminated, next_q, next_log_probs, alpha, gamma):
@@ -461,13 +455,11 @@ def evaluate(policy, env, seed):
     return episode_return, length
 
 
-def make_training_env(task, privileged, main_process):
+def make_training_env(task, privileged):
     """The task as the agent sees it in training: actions in [-1, 1], flat observations, the return of each episode.
 
     With `privileged`, the environment's `privileged_observation` (S − O,), if it has one, follows the observation (O,).
     """
-    if os.getpid() != main_process:  # AsyncVectorEnv makes one in the main process, too, to see its spaces
-        common.prepare_worker()  # ignores Ctrl-C, and ends with the main process
     env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
     low = env.action_space.low
     high = env.action_space.high
@@ -486,7 +478,14 @@ def make_training_env(task, privileged, main_process):
 
 def make_vector_env(task, config):
     """`num_envs` environments (K), each in a worker process. One whose episode has ended resets itself at once."""
-    make = partial(make_training_env, task, config.privileged_critics, os.getpid())
+    privileged = config.privileged_critics
+    main_process = os.getpid()
+
+    def make():
+        if os.getpid() != main_process:  # AsyncVectorEnv makes one in the main process, too, to see its spaces
+            common.prepare_worker()  # ignores Ctrl-C, and ends with the main process
+        return make_training_env(task, privileged)
+
     method = common.start_method(config.env_id)  # fork, spawn or forkserver
     autoreset = gym.vector.AutoresetMode.SAME_STEP
     return gym.vector.AsyncVectorEnv([make] * config.num_envs, context=method, autoreset_mode=autoreset)
@@ -512,12 +511,12 @@ def store(buffer, observations, actions, result, run):
 def train(config, resume=None):
     """Trains as `config` says and returns the run directory's path.
 
-    With `resume`, a run's directory, that run continues: `common.continued` says what is then taken from `config`.
-    Raises InputError for what cannot be used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
+    `resume` is the directory of a run that continues: see `common.continued`. Raises InputError for what cannot be
+    used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
     rank, world_size = common.join_processes()  # this process's number and their count, of torchrun; else 0 and 1
-    with common.Run("sac_minitaur", config, evaluate, (rank, world_size)) as run:  # it calls `evaluate`
+    with common.Run("sac_minitaur", config, evaluate, rank, world_size) as run:  # starts processes that call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
         _, state_size = envs.observation_space.shape  # S, with the privileged numbers
@@ -540,10 +539,8 @@ def train(config, resume=None):
             agent.fit_scaling(buffer.observations[: buffer.size], buffer.rewards[: buffer.size])
 
         for step in range(start, config.num_iterations):
-            # gymnasium cannot save a task in mid-episode, and pybullet does not restore contacts exactly. So a resumed
-            # run begins new episodes at its checkpoint. Every run does so at every checkpoint: then a run that was
-            # killed and resumed equals one that was left alone. The cut is no termination: the targets of the
-            # transitions before it keep Q(s', a').
+            # A resumed run begins new episodes at its checkpoint, so every run does so: see dqn_cartpole.py. The cut is
+            # no termination: the targets of the transitions before it keep Q(s', a').
             if step == start or step % config.checkpoint_interval == 0:
                 run.save(step)
                 observations, _ = envs.reset(seed=[common.derive_seed(config.seed, i, step) for i in env_numbers])
@@ -804,10 +801,8 @@ def main():
     config, resume, policy_file = common.read_command_line("sac_minitaur", Config, TUTORIAL, __doc__)
     if policy_file is None:
         train(config, resume)
-        return
-    task, observation_space, action_space = common.find_task(config, gym.spaces.Box, training=False)
-    policy = Policy(config, observation_space, action_space)
-    common.evaluate_file(policy_file, "sac_minitaur", config, policy, task, evaluate)
+    else:
+        common.evaluate_file(policy_file, "sac_minitaur", config, Policy, gym.spaces.Box, evaluate)
 
 
 if __name__ == "__main__":

@@ -132,7 +132,7 @@ def test_all_stop_with_one(tmp_path):
 def test_a_batch_that_two_processes_cannot_share():
     config = sac_minitaur.Config(batch_size=25, device="cpu")
     with pytest.raises(common.InputError, match="^--batch-size 25 cannot be shared by 2 processes"):
-        common.Run(SCRIPT, config, sac_minitaur.evaluate, processes=(0, 2))
+        common.Run(SCRIPT, config, sac_minitaur.evaluate, rank=0, world_size=2)
 
 
 def test_torchrun_ends_when_a_rank_is_killed(tmp_path):

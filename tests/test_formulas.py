@@ -133,10 +133,12 @@ def test_dqn_acts_greedily_but_for_a_part_of_the_actions():
     assert (actions == greedy).float().mean() == pytest.approx(1 - 0.3 / 2, abs=0.025)
 
 
-@pytest.mark.parametrize("rewards, unit", [([0.0, 0.0], (0, 1)), ([0.0, -4.0], (-20, 20))])
-def test_dqn_value_unit(rewards, unit):
-    """Where no reward was seen, nobody knows a unit: 1."""
-    agent = dqn_agent(gamma=0.9)
+@pytest.mark.parametrize(
+    "gamma, rewards, unit", [(0.9, [0.0, 0.0], (0, 1)), (0.9, [0.0, -4.0], (-20, 20)), (1, [0.0, -4.0], (0, 1))]
+)
+def test_dqn_value_unit(gamma, rewards, unit):
+    """It is 1 where no reward was seen, and without a discount."""
+    agent = dqn_agent(gamma=gamma)
     agent.fit_scaling(torch.ones(2, 4), torch.tensor(rewards))
     assert (agent.value_offset.item(), agent.value_scale.item()) == pytest.approx(unit)
 

@@ -73,9 +73,9 @@ def test_tutorial_sets_every_value_that_is_ours_to_theirs(script):
 
 OUT_OF_RANGE = {
     "sac_minitaur": """
-        --batch-size 0, --num-envs 1025, --critic-layers 0, --device tpu, --env-id a:b:c, --actor-learning-rate -1,
+        --batch-size 0, --num-envs 0, --critic-layers 0, --device tpu, --env-id a:b:c, --actor-learning-rate -1,
         --adam-beta1 1, --gamma 1.01, --initial-log-alpha nan, --seed -1, --batch-size x, --wings 2""",
-    "dqn_cartpole": "--gamma 1, --learning-rate-decay 0, --num-envs 2, --resume x --evaluate y, --tutorial --resume x",
+    "dqn_cartpole": "--learning-rate-decay 0, --num-envs 2, --resume x --evaluate y, --tutorial --resume x",
 }
 
 

@@ -5,7 +5,6 @@ import dataclasses
 import importlib
 import importlib.util
 import math
-import os
 import sys
 import types
 from pathlib import Path
@@ -232,8 +231,8 @@ def test_dynamics_can_be_given(env):
 
 
 def test_what_only_critics_see_is_all_that_training_adds(env):
-    assert sac_minitaur.make_training_env(env.spec, False, os.getpid()).observation_space == env.observation_space
-    with contextlib.closing(sac_minitaur.make_training_env(env.spec, True, os.getpid())) as training_env:
+    assert sac_minitaur.make_training_env(env.spec, False).observation_space == env.observation_space
+    with contextlib.closing(sac_minitaur.make_training_env(env.spec, True)) as training_env:
         assert training_env.observation_space.shape == (28 + 7,)
         observation, _ = env.reset(seed=3)
         extended, _ = training_env.reset(seed=3)

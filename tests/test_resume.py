@@ -127,7 +127,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
             assert f"stopped at step {name.split()[-1]}" in run.stdout
     assert not list(run_dir.glob("*.mp4"))
     (run_dir / "notes.csv").write_text("a student's own\n")
-    (run_dir / ".tmp-1-checkpoint.pt").write_text("left by a kill")
+    (run_dir / ".tmp-checkpoint.pt").write_text("left by a kill")
     (run_dir / "best_policy.pt").write_bytes((run_dir / "policy.pt").read_bytes())  # of after the checkpoint
     # The real command, in a new interpreter, from another directory. The run knows that it was raised.
     run_python(tmp_path, ROOT / f"{script}.py", *resume)

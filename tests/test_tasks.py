@@ -130,7 +130,7 @@ def test_actions_never_leave_the_bounds(dtype, scale, register):
     config = sac_minitaur.Config(actor_layers=())
     policy = sac_minitaur.Policy(config, gym.spaces.Box(-1, 1, (1,)), space)
     task = gym.spec(register(low=low, high=high, dtype=dtype))
-    env = sac_minitaur.make_training_env(task, False, os.getpid())
+    env = sac_minitaur.make_training_env(task, False)
     env.reset()
     for sign in (-1, 1, 0.999, -1e-3):
         with torch.no_grad():
@@ -161,7 +161,7 @@ def test_a_task_without_a_time_limit_gets_one_and_says_so(register, tmp_path, ca
     env_id = register(limit=None, discrete=True)
     config = dqn_cartpole.Config(env_id=env_id, checkpoint_interval=5)  # it may be shorter than our limit
     task, *_ = common.find_task(config, gym.spaces.Discrete)
-    assert task.max_episode_steps == 10_000
+    assert task.max_episode_steps == 1_000
     path = train("dqn_cartpole", tmp_path / "run", env_id=env_id, max_episode_steps=7)
     assert "at most 7 steps" in capsys.readouterr().out
     assert {row["average_episode_length"] for row in read_csv(path / "eval.csv") + read_csv(path / "random.csv")} == {7}
