@@ -193,6 +193,10 @@ def interrupt():
     signal.raise_signal(signal.SIGINT)
 
 
+def terminate():
+    signal.raise_signal(signal.SIGTERM)
+
+
 def before_call(owner, name, count, action, module=None):
     """Replaces a function by one that calls `action()` before its call number `count`.
 

@@ -16,7 +16,7 @@ import common
 import dqn_cartpole
 import sac_minitaur
 from runs import AGENTS, MODULES, ROOT, Process, assert_same_run, before_call, checkpoint, die, flags
-from runs import interrupt, read_command_line, read_csv, rows, run_python, session, wait_until
+from runs import interrupt, read_command_line, read_csv, rows, run_python, session, terminate, wait_until
 
 
 def test_reference_is_worth_comparing_with(script, reference):
@@ -117,6 +117,7 @@ def test_stopped_killed_and_raised_at_every_moment(script, reference, tmp_path):
         ("evaluation at 300", resume, partial(second_evaluation, interrupt), 130),
         ("film", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, die), killed),
         ("film stopped", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, interrupt), 130),
+        ("film ended", [*resume, "--video"], partial(before_call, common.Run, "_film", 1, terminate), -signal.SIGTERM),
     )
     for name, arguments, hook, status in stages:
         run = Process(script, arguments, tmp_path / name, hook)
