@@ -55,7 +55,7 @@ def run_main(main):
     """Calls `main` as a script does: an InputError becomes one line and exit status 2, Ctrl-C exit status 130."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a notebook's have not
-            stream.reconfigure(errors="replace", line_buffering=True)  # a console without an α shows a question mark
+            stream.reconfigure(errors="replace")  # a console without an α shows a question mark
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
     atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
     try:
@@ -69,6 +69,12 @@ def run_main(main):
     if dist.is_initialized():
         os._exit(status)  # torchrun's other processes are not waited for: they may be gone
     sys.exit(status)
+
+
+def say(line):
+    """Prints a line at once, above the progress bar."""
+    tqdm.write(line)
+    sys.stdout.flush()
 
 
 def one_line(error):
@@ -207,7 +213,7 @@ def find_task(config, needed, training=True):
         require_spaces(name, env.observation_space, env.action_space, needed)
         for wrapper in ("NormalizeObservation", "NormalizeReward"):
             if wrapper in str(env):  # which names all wrappers
-                tqdm.write(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
+                say(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
         limit = env.spec.max_episode_steps  # the flag's, if there is one
         task = gym.spec(env.unwrapped.spec.id)  # env.spec lists the task's own wrappers, which gym.make may refuse
     if training and limit and limit > config.checkpoint_interval * config.collect_steps_per_iteration:
@@ -415,12 +421,12 @@ def evaluate_file(path, script, config, policy_class, needed, evaluate):
     seeds = evaluation_seeds(config)
     with gym.make(task) as env:
         _, text = summarize([evaluate(policy, env, seed) for seed in tqdm(seeds, disable=None)])
-    tqdm.write(f"{path}: {text}")
+    say(f"{path}: {text}")
     if config.video:
         video = path.with_suffix(".mp4")
         with or_warn("film"):
             film(video, task, seeds[0], [(policy, "")])
-            tqdm.write(f"filmed one episode: {video}")
+            say(f"filmed one episode: {video}")
 
 
 @contextlib.contextmanager
@@ -429,7 +435,7 @@ def or_warn(what):
     try:
         yield
     except Exception as error:
-        tqdm.write(f"warning: no {what} ({one_line(error)})")
+        say(f"warning: no {what} ({one_line(error)})")
 
 
 def film(path, task, seed, clips, seconds=math.inf):
@@ -660,8 +666,8 @@ class Run:
             self._begin_files(new=checkpoint is None)
             limit = self.task.max_episode_steps
             task = f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps"
-            tqdm.write(f"{task}, on {self.device}")
-            tqdm.write(f"run directory {self.path}")
+            say(f"{task}, on {self.device}")
+            say(f"run directory {self.path}")
         if not checkpoint:
             self.save(step)  # from here on --resume continues the run
         self.evaluate(0, policy=None)
@@ -740,7 +746,7 @@ class Run:
         episodes = {"collect_return": mean_return, "collect_episode_length": mean_length}
         self._add_row("train", step, {"steps_per_second": speed} | episodes | values)
         losses = ", ".join(f"{name} = {value:.4g}" for name, value in values.items() if "loss" in name)
-        tqdm.write(f"step = {step}: {losses}, steps per second = {speed:.0f}")
+        say(f"step = {step}: {losses}, steps per second = {speed:.0f}")
 
     def _add_row(self, table, step, values):
         seconds = round(time.perf_counter() - self.started, 3)
@@ -766,7 +772,7 @@ class Run:
             return
         row, text = summarize([episode.result() for episode in episodes])
         self._add_row(table, step, row)
-        tqdm.write(f"step = {step}: {text}" if policy else f"random policy: {text}")
+        say(f"step = {step}: {text}" if policy else f"random policy: {text}")
         if policy:
             self.progress.set_postfix_str(f"return {row['average_return']:.2f}")
             require_finite(policy.state_dict(), step)
@@ -792,7 +798,7 @@ class Run:
             self.progress.close()
             self._plot()
             how = f"--resume '{self.path}' (in Python: resume={str(self.path)!r})"
-            tqdm.write(f"stopped at step {step}; to continue: {how}")
+            say(f"stopped at step {step}; to continue: {how}")
         raise KeyboardInterrupt
 
     def finish(self, step, observation_shape):
@@ -812,14 +818,14 @@ class Run:
             export_policy(self.path / "policy.pt2", cpu_copy(self.agent.policy), observation_shape)
             export_policy(self.path / "best_policy.pt2", cpu_copy(self.agent.policy, self.best[1]), observation_shape)
         files = sorted(path.name for path in self.path.iterdir())
-        tqdm.write(f"finished; {self.path} holds {', '.join(files)}")
+        say(f"finished; {self.path} holds {', '.join(files)}")
 
     def _plot(self):
         title = f"{self.config.env_id}, seed {self.config.seed}"
         plot_learning_curve(self.path / "learning_curve.png", self.tables, title, self.task.reward_threshold)
 
     def _film(self):
-        tqdm.write("filming the trained agent, a random one, and how it learned ...")
+        say("filming the trained agent, a random one, and how it learned ...")
         seed = evaluation_seeds(self.config)[0]
         learning = []
         for step, average_return, weights in self.snapshots:
