@@ -54,10 +54,10 @@ class InputError(Exception):
 def run_main(main):
     """Calls `main` as a script does: an InputError becomes one line and exit status 2, Ctrl-C exit status 130."""
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a notebook's have not
+        if hasattr(stream, "reconfigure"):  # a notebook's lack it
             stream.reconfigure(errors="replace")  # a console without an α shows a question mark
     os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a message says enough
-    atexit.register(gc.freeze)  # or Python would search all that was imported for garbage before it ends: a second
+    atexit.register(gc.freeze)  # saves a second at exit: no search for garbage among all that was imported
     try:
         main()
         return
@@ -97,7 +97,7 @@ class Source:
 def read_command_line(script, config_class, tutorial, description):
     """The config, --resume's directory or None, and --evaluate's file or None. Raises InputError.
 
-    It is read twice. The first reading looks for a `Source` alone, and so for the defaults: `tutorial`, a dict, or the
+    It is read twice. The first reading finds the `Source` alone. It tells the defaults: `tutorial`, a dict, or the
     config of a saved run or policy.
     """
     given, _ = tyro.cli(Source, return_unknown_args=True, add_help=False)
@@ -123,7 +123,7 @@ def continued(config, resume, script):
     """The config to train with, and the checkpoint of the run in the directory `resume`; for a new run it is None.
 
     A run that continues takes `MAY_CHANGE_ON_RESUME` from `config`, and all else from its checkpoint. Raises InputError
-    for other values in `config`, except defaults.
+    where another value differs from both the run's and the default.
     """
     if resume is None:
         return config, None
@@ -198,7 +198,7 @@ def find_task(config, needed, training=True):
     """The gymnasium spec of --env-id, with a time limit, and its observation and action spaces.
 
     Raises InputError when the task is unknown, or its action space is not what is `needed`, `gym.spaces.Discrete` or
-    `Box`; for `training` also when no episode can reach its time limit between two checkpoints.
+    `Box`; for `training` also when no episode can reach the task's time limit between two checkpoints.
     """
     draw_without_display()
     name = f"--env-id {config.env_id}"
@@ -215,7 +215,7 @@ def find_task(config, needed, training=True):
             if wrapper in str(env):  # which names all wrappers
                 say(f"warning: evaluations have their own {wrapper}: it cannot know the statistics of training")
         limit = env.spec.max_episode_steps  # the flag's, if there is one
-        task = gym.spec(env.unwrapped.spec.id)  # env.spec lists the task's own wrappers, which gym.make may refuse
+        task = gym.spec(env.unwrapped.spec.id)  # not env.spec: gym.make may refuse the wrappers in it
     if training and limit and limit > config.checkpoint_interval * config.collect_steps_per_iteration:
         what = f"--checkpoint-interval {config.checkpoint_interval} cuts each episode of {limit} steps"
         raise InputError(f"{what} before its end: use a larger one, or a smaller --max-episode-steps")
@@ -266,7 +266,7 @@ class ObservationScaling(torch.nn.Module):
         high = observations.amax(0)
         average([low, high])  # in place: the processes' mean extremes, so that all have the same scales
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        self.bounded &= self.half_range <= 130 * spread  # the ratio is up to 84 in CartPole, 127.5 for a constant byte
+        self.bounded &= self.half_range <= 130 * spread  # CartPole has at most 84, a constant uint8 127.5
         self.center[~self.bounded] = 0.0
         self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
@@ -278,12 +278,12 @@ class ObservationScaling(torch.nn.Module):
 
 
 def derive_seed(seed, *key):
-    """A 32-bit seed from a run's seed and a key: numbers of the environment, update or episode that it is for."""
+    """A 32-bit seed from a run's seed and a key: numbers of the environment, process, update or episode."""
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
 
 
 def evaluation_seeds(config):
-    """The seeds of every evaluation's episodes. Training has none of them: the first numbers of its keys are small."""
+    """The seeds of every evaluation's episodes. Training has none of them: its keys begin with small numbers."""
     return [derive_seed(config.seed, 2**32 - 1, i) for i in range(config.num_eval_episodes)]
 
 
@@ -326,7 +326,7 @@ def average(tensors):
 def start_method(env_id):
     """How to start workers: "fork" is the quickest, but a forked process lacks the main process's threads and CUDA.
 
-    A package (package:Task-v0) or JAX may have threads, and would wait for them for ever. So its workers start clean.
+    With a package (package:Task-v0) or JAX, a fork may wait for ever for threads that it lacks: workers start clean.
     """
     if sys.platform != "linux":
         return "spawn"
@@ -338,7 +338,7 @@ def start_method(env_id):
 
 @contextlib.contextmanager
 def worker_pool(size, method):
-    """A pool of `size` processes. At the end it kills all that began since, also SAC's environments after an error."""
+    """A pool of `size` processes. At the end it kills each process started since then, SAC's environments, too."""
     children_before = set(multiprocessing.active_children())
     pool = futures.ProcessPoolExecutor(size, multiprocessing.get_context(method), prepare_worker)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # new processes inherit it
@@ -362,9 +362,9 @@ def prepare_worker():
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     draw_without_display()
     if hasattr(os, "nice"):  # not on Windows
-        os.nice(5)  # the main process goes first. Its update is what SAC's environments, workers too, wait for
+        os.nice(5)  # the main process goes first: SAC's environments, workers too, wait for its update
     torch.set_num_threads(1)
-    np.random.seed()  # a task may use these generators: all workers begin with copies of the same
+    np.random.seed()  # forked workers have equal generators, which a task may use
     torch.seed()
 
     def end_with_main_process():
@@ -580,7 +580,7 @@ class TableWriter:
         from torch.utils.tensorboard import SummaryWriter  # here: it takes a second
 
         for events in path.glob("events.out.tfevents.*"):
-            events.unlink()  # left before a resume: they may have rows of after the checkpoint
+            events.unlink()  # left before a resume: they may have rows from after the checkpoint
         self.path = path
         self.tables = tables  # the run's own lists: `add` extends them
         self.board = SummaryWriter(path)
@@ -652,7 +652,7 @@ class Run:
         self.stack.close()
 
     def begin(self, task, agent, buffer, checkpoint):
-        """Restores the checkpoint, begins the files, evaluates random actions. Returns the number of updates done."""
+        """Restores the checkpoint, begins the files, evaluates random actions once. Returns the updates done."""
         self.task = task
         self.pickled_task = cloudpickle.dumps(task)
         self.agent = agent
@@ -664,9 +664,9 @@ class Run:
         self.stack.callback(self.progress.close)
         if self.rank == 0:
             self._begin_files(new=checkpoint is None)
-            limit = self.task.max_episode_steps
-            task = f"{self.config.env_id}, seed {self.config.seed}, episodes of at most {limit} steps"
-            say(f"{task}, on {self.device}")
+            limit = task.max_episode_steps
+            config = self.config
+            say(f"{config.env_id}, seed {config.seed}, episodes of at most {limit} steps, on {self.device}")
             say(f"run directory {self.path}")
         if not checkpoint:
             self.save(step)  # from here on --resume continues the run
@@ -698,7 +698,7 @@ class Run:
                 raise InputError(f"{what}: name a new directory") from None
         with whole_file(self.path / "config.json") as file:
             file.write(json.dumps(self.plain_config, indent=2).encode())
-        if self.best[1] is not None:  # after a resume: the file may have weights of after the checkpoint
+        if self.best[1] is not None:  # after a resume: the file may have weights from after the checkpoint
             self._write("best_policy.pt", "policy", {"weights": self.best[1]})
         self.writer = TableWriter(self.path, self.tables)
         self.stack.callback(self.writer.board.close)
@@ -803,7 +803,7 @@ class Run:
 
     def finish(self, step, observation_shape):
         """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
-        self.save(step)  # before the evaluation: a longer run, which --resume may make of this one, lacks it
+        self.save(step)  # before the evaluation: a run that --resume makes longer has none here
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
         if self.rank:

@@ -59,19 +59,19 @@ class Config:
     gamma: common.Fraction = 0.99  # ours (theirs: 1, TF-Agents' default): discount
     time_limit_terminates: bool = False  # ours (theirs: yes, in 2023): a time limit counts as an end of the task
     target_update_tau: common.Fraction = 0.05  # ours (theirs: 1, so no slow copy): Q̄ ← Q̄ + τ (Q − Q̄), in the weights
-    value_unit: bool = True  # ours (theirs: no): learn Q in units of 1 / (1 − γ), if γ < 1: see `fit_scaling`
-    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): widens the gap to worse actions: see `update`
+    value_unit: bool = True  # ours (theirs: no): learn Q in units of mean |r| / (1 − γ): see `fit_scaling`
+    advantage_learning: common.Below1 = 0.9  # ours (theirs: 0): β, widens the gap to worse actions: see `update`
     observation_scaling: bool = True  # ours (theirs: no): bring observations near [-1, 1]: `common.ObservationScaling`
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
 
-    seed: common.Seed = 0  # source of all randomness
+    seed: common.Seed = 0  # source of the run's randomness
     device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
     num_threads: PositiveInt = 1  # CPU threads of the update; more gain nothing here
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 200  # updates between rows of train.csv
     eval_interval: PositiveInt = 1_000  # updates between evaluations
-    num_eval_episodes: PositiveInt = 10  # episodes in each evaluation
+    num_eval_episodes: PositiveInt = 10  # episodes per evaluation
     checkpoint_interval: PositiveInt = 5_000  # updates between checkpoints. Each cuts the running episode: see `train`
 
 
@@ -128,7 +128,7 @@ class Policy(nn.Module):
     def forward(self, observation):
         """Actions (batch,) for raw observations (batch, …)."""
         output = self.q_network(self.scaling(observation.flatten(1)))
-        return output.argmax(1)  # the largest Q, too: Q = offset + scale × output, with scale > 0
+        return output.argmax(1)  # of the largest Q: it is offset + scale × output, with scale > 0
 
     @torch.inference_mode()
     def act(self, observation):
@@ -189,7 +189,7 @@ class DQNAgent(nn.Module):
         self.config = config
         self.device = device
         self.num_actions = int(action_space.n)
-        self.generator = torch.Generator()  # of actions and batches. A task may use PyTorch's global one
+        self.generator = torch.Generator()  # for actions and batches: a task cannot disturb it
         self.generator.manual_seed(config.seed)
         self.policy = Policy(config, observation_space, action_space)
         self.scaling = self.policy.scaling  # the same module, not a copy. So is the network
@@ -315,7 +315,7 @@ def train(config, resume=None):
     with common.Run("dqn_cartpole", config, evaluate) as run:  # starts processes that will call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Discrete)  # task: a gymnasium spec
         env = gym.wrappers.RecordEpisodeStatistics(gym.make(task))
-        env = gym.wrappers.FlattenObservation(env)  # a flat copy (O,): the task may change its own array later
+        env = gym.wrappers.FlattenObservation(env)  # (O,), a copy: some tasks overwrite their own array
         torch.manual_seed(config.seed)
         agent = DQNAgent(config, observation_space, action_space, run.device)
         buffer = ReplayBuffer(config.replay_buffer_capacity, math.prod(observation_space.shape), run.device)

@@ -18,8 +18,9 @@ The minimum is over the two critics, not over actions. The actor uses it, too: a
 exploits its errors. In SAC's paper slow copies of the critics, the target critics, compute y. Here the critics compute
 it themselves, as in CrossQ, a later variant of SAC (arXiv:1902.05605): batch normalization makes this stable enough.
 
-It reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023): Haarnoja et al. 2018, "Soft Actor-Critic
-Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says why.
+This script reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023), after Haarnoja et al. 2018, "Soft
+Actor-Critic Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says
+why.
 """
 
 import copy
@@ -70,12 +71,12 @@ class Config:
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
     averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): the policy averages actors: see `SACAgent`
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): per number of an action; a uniform has ln 2 = 0.69
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): per number of an action; uniform actions have ln 2
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
 
-    seed: common.Seed = 0  # source of all randomness
+    seed: common.Seed = 0  # source of the run's randomness
     device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
     num_threads: PositiveInt = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
     cuda_graph: bool = False  # on a GPU: record the update once and repeat it, about twice as fast: see `cuda_graph`
@@ -109,7 +110,7 @@ TUTORIAL = {
 
 
 # In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action.
-# The agent and the buffer take observations (…, S), the critics' states; the actor uses the first O numbers.
+# The agent and the buffer call all S numbers an observation, the critics call them a state. The actor uses the first O.
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
@@ -138,13 +139,13 @@ class Actor(nn.Module):
         """Mean and log standard deviation before squashing, (…, A) each, for observations (…, O or more)."""
         outputs = self.net(observation[..., : self.observation_size])
         mean, log_std = outputs.chunk(2, dim=-1)
-        return mean, log_std.clamp(-20, 2)  # ours, also with --tutorial: the bounds of 2018 and of the authors' code
+        return mean, log_std.clamp(-20, 2)  # 2018's and the authors' bounds, also with --tutorial
 
     def sample(self, observation):
         """Actions (…, A) and their log-probabilities (…), differentiable with respect to the network.
 
-        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). The code computes the
-        slope's log(1 − tanh²u) as 2 (log 2 − u − softplus(−2u)), which is equal, but finite where tanh u rounds to ±1.
+        With a = tanh(u), log π(a) = log N(u) − Σ log(1 − tanh²u) (arXiv:1812.05905, appendix C). 1 − tanh²u is tanh's
+        slope. The code has its log as 2 (log 2 − u − softplus(−2u)), which is finite where tanh u rounds to ±1, too.
         """
         mean, log_std = self(observation)
         noise = torch.randn_like(mean)
@@ -197,7 +198,7 @@ class Policy(nn.Module):
 
 
 def to_bounds(action, low, high):
-    """Maps an action from [-1, 1] to [low, high]. The halves avoid overflow, the clip undoes rounding errors."""
+    """Maps an action from [-1, 1] to [low, high]. Halves, because high − low may overflow; clip, because it rounds."""
     return (low / 2 + high / 2 + (high / 2 - low / 2) * action).clip(low, high)
 
 
@@ -255,7 +256,7 @@ def actor_loss(log_probs, q, alpha):
 
 
 def alpha_loss(log_alpha, log_probs, target_entropy):
-    """log α × (entropy − target entropy), where the entropy is the mean of −log π: log_probs (B,).
+    """The mean of −log α (log π + target entropy), which is log α × (entropy − target entropy): log_probs (B,).
 
     A gradient step raises α while the entropy is too low. As in TF-Agents; equation 18 of arXiv:1812.05905 has α where
     this has log α: the gradient's sign is the same.
@@ -314,7 +315,7 @@ class SACAgent(nn.Module):
             self.reward_scale.copy_(self.config.reward_scale_factor / divisor)
 
     def scaled(self, observations):
-        """Observations (…, S) with the task's numbers scaled. The privileged ones stay as they are."""
+        """Observations (…, S) with the task's O numbers scaled. The critics' batch norm scales the privileged ones."""
         size = self.actor.observation_size
         return torch.cat((self.scaling(observations[..., :size]), observations[..., size:]), dim=-1)
 
@@ -361,13 +362,13 @@ class SACAgent(nn.Module):
             self.critics.eval()  # the actor's step uses the running statistics
         with torch.no_grad():
             y = td_targets(rewards, terminated, next_q, next_log_probs, alpha, config.gamma)  # (B,)
-        loss = critic_loss(q, y, config.critic_loss_weight)  # critic_loss_weight × Σ mean (Q − y)²
+        loss = critic_loss(q, y, config.critic_loss_weight)
 
         self.critic_optimizer.zero_grad()
         loss.backward()
         # Several processes: the mean of their gradients, and of batch normalization's running means and variances.
         gradients = [parameter.grad for parameter in self.critics.parameters()]
-        statistics = [tensor for tensor in self.critics.buffers() if tensor.is_floating_point()]  # not the step counter
+        statistics = [tensor for tensor in self.critics.buffers() if tensor.is_floating_point()]  # not the batch count
         common.average(gradients + statistics)
         self.critic_optimizer.step()
         if not config.critic_batch_norm:  # the target critics follow: θ̄ ← θ̄ + τ (θ − θ̄)
@@ -379,7 +380,7 @@ class SACAgent(nn.Module):
         s = self.scaled(batch[0])  # (B, S)
         alpha = self.log_alpha.detach().exp()
         new_a, log_probs = self.actor.sample(s)  # (B, A), (B,)
-        self.critics.requires_grad_(False)  # the loss passes through the critics; they keep their weights
+        self.critics.requires_grad_(False)  # the loss passes through them, but they need no gradients
         loss = actor_loss(log_probs, self.critics(s, new_a), alpha)
         loss_alpha = alpha_loss(self.log_alpha, log_probs, self.target_entropy)
 
@@ -427,7 +428,7 @@ def cuda_graph(agent, function):
             for group in groups:
                 group["capturable"] = True  # PyTorch refuses to record an Adam step without it
             recorded = batch
-            with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # of this GPU; computes nothing
+            with torch.cuda.graph(graph, stream=torch.cuda.Stream(agent.device)):  # records only, on this GPU
                 metrics = function(recorded)
             for group in groups:
                 group["capturable"] = False  # a checkpoint would have True, and a run without a graph would warn
@@ -515,7 +516,7 @@ def train(config, resume=None):
     used, and KeyboardInterrupt after Ctrl-C, once a checkpoint is saved.
     """
     config, checkpoint = common.continued(config, resume, "sac_minitaur")
-    rank, world_size = common.join_processes()  # this process's number and their count, of torchrun; else 0 and 1
+    rank, world_size = common.join_processes()  # torchrun's: this process's number, their count; else 0, 1
     with common.Run("sac_minitaur", config, evaluate, rank, world_size) as run:  # starts processes that call `evaluate`
         task, observation_space, action_space = common.find_task(config, gym.spaces.Box)
         envs = make_vector_env(task, config)
@@ -548,7 +549,7 @@ def train(config, resume=None):
                 run.evaluate(step, agent.policy)
             run.stop_if_requested(step)
 
-            for _ in range(config.collect_steps_per_iteration - 1):  # all but the last, which the update accompanies
+            for _ in range(config.collect_steps_per_iteration - 1):  # the last one is below, during the update
                 actions = agent.act(observations)
                 observations = store(buffer, observations, actions, envs.step(actions), run)
             # The update learns from the steps before this one, while the simulators work.
@@ -613,7 +614,7 @@ class MinitaurBulletEnv(gym.Env):
     Action (8,): the swings of the legs front left, back left, front right, back right, then their extensions, in
     [-1, 1], held for 0.01 s. Use float32: the motor commands are computed in the action's precision.
     Observation (28,): 8 motor angles in rad, 8 motor velocities in rad/s, 8 observed torques in N·m, the base's
-    orientation as a quaternion (x, y, z, w); the original's float64 values in the float32 of its observation space.
+    orientation as a quaternion (x, y, z, w); the original's float64 values, rounded to float32.
     Reward: metres forward in this step − 0.005 × |observed torques · motor velocities| in W × 0.002 s. As in the
     original the energy counts one substep of the five.
     Terminated when the robot has fallen. `reset(options={"dynamics": d})` uses a `Dynamics` instead of drawing one.
@@ -715,7 +716,7 @@ class MinitaurBulletEnv(gym.Env):
             change(self.robot, link, lateralFriction=dynamics.foot_friction)
 
     def step(self, action):
-        """Raises ValueError when an action component is outside ±1.01, as the original does."""
+        """Raises ValueError unless all components are within ±1.01 (NaN is not), as the original does."""
         action = 1.0 * np.asarray(action)  # integers become floats, float32 stays float32
         if not (np.abs(action) <= 1.01).all():
             raise ValueError(f"action {action} is outside [-1.01, 1.01]")
@@ -749,7 +750,7 @@ class MinitaurBulletEnv(gym.Env):
         dynamics = self.dynamics
         pwm = (-self.KP * (self.angle - command) - self.KD * self.velocity).clip(-1, 1)  # share of the voltage
         drive = pwm * dynamics.voltage
-        # The robot observes a torque without back-EMF and the iron's saturation. The torque that moves it has both.
+        # The observed torque ignores back-EMF and the iron's saturation. The torque that moves the robot has both.
         limit = self.MAX_OBSERVED_TORQUE
         self.observed_torque = (self.TORQUE_CONSTANT * (drive / self.RESISTANCE)).clip(-limit, limit)
         back_emf = (self.TORQUE_CONSTANT + dynamics.viscous_damping) * self.velocity  # pybullet adds the damping here
@@ -790,7 +791,7 @@ class MinitaurBulletEnv(gym.Env):
         return np.asarray(pixels, np.uint8).reshape(360, 480, 4)[..., :3]
 
     def close(self):
-        self.simulator = None  # its finalizer disconnects, once: a newer simulation may have the same number
+        self.simulator = None  # its finalizer disconnects, only once: pybullet reuses the numbers of clients
 
 
 if "MinitaurBulletEnv-v0" not in gym.registry:
