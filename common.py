@@ -101,7 +101,7 @@ def read_command_line(script, config_class, tutorial, description):
     config of a saved run or policy.
     """
     given, _ = tyro.cli(Source, return_unknown_args=True, add_help=False)
-    if sum(map(bool, (given.tutorial, given.resume, given.evaluate))) > 1:
+    if sum(bool(value) for value in vars(given).values()) > 1:
         raise InputError("--tutorial, --resume and --evaluate exclude each other: give one of them")
     if given.resume is not None:
         _, default = read_file(given.resume / "checkpoint.pt", "checkpoint", script, config_class)
