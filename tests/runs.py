@@ -119,8 +119,9 @@ def session(leader):
 
 
 def run_python(directory, *arguments):
-    """Runs a new interpreter in a directory, whose modules it finds beside this project's."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), str(directory)))}
+    """Runs a new interpreter in a directory, whose modules it finds beside this project's. It prints ASCII alone."""
+    path = os.pathsep.join((str(ROOT), str(directory)))
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONIOENCODING": "ascii", "CUDA_VISIBLE_DEVICES": ""}
     command = [sys.executable, *map(str, arguments)]
     process = subprocess.run(command, cwd=directory, env=environment, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr

@@ -80,8 +80,8 @@ def test_dqn_update(tutorial):
     loss = (y - q).square().mean()
     gradients = torch.autograd.grad(loss, list(agent.q_network.parameters()))
     old = [parameter.detach().clone() for parameter in agent.q_network.parameters()]
-    metrics = agent.update(batch, 6000)
-    learning_rate = 0.01 if tutorial else 0.01 / (1 + (6000 / 3000) ** 2)
+    metrics = agent.update(batch, 9000)
+    learning_rate = 0.01 if tutorial else 0.01 / (1 + (9000 / 3000) ** 2)
     torch.testing.assert_close(metrics, {"loss": loss.detach(), "mean_q": q.mean().detach()})
     moved = zip(gradients, old, old_target, agent.q_network.parameters(), agent.target_network.parameters())
     for gradient, before, target_before, after, target in moved:
@@ -306,9 +306,6 @@ def test_policy_acts_with_the_mean_in_the_tasks_units():
     expected = torch.tensor([[5.0, -1.0], [0.0, 5.5]]) + torch.tensor([[5.0, 2.0], [1.0, 0.5]]) * squashed
     torch.testing.assert_close(actions, expected)
     np.testing.assert_allclose(policy.act(observations[0].numpy()), expected[0].detach(), rtol=1e-5, atol=1e-6)
-    with torch.no_grad():
-        policy.actor.net[-1].bias[:4] = 100
-    assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
 
 
 @pytest.mark.parametrize("batch_norm", (True, False))
@@ -395,16 +392,15 @@ def test_sac_update(batch_norm):
 
 def test_actor_and_alpha_are_updated_at_every_few_updates():
     agent = sac_agent(actor_update_interval=3, averaged_actor_tau=0.5)
-    moved = []
+    others = {"actor.net.0.weight", "log_alpha", "policy.actor.net.0.weight"}
     for step in range(7):
         before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
         metrics = agent.update(sac_batch(), step)
-        changed = {name for name, tensor in agent.state_dict().items() if not torch.equal(tensor, before[name])}
-        assert "critics.q1.1.weight" in changed and "critic_loss" in metrics
-        others = {"actor.net.0.weight", "log_alpha", "policy.actor.net.0.weight"}
-        assert others <= changed and "actor_loss" in metrics or not (others & changed or "actor_loss" in metrics)
-        moved.append("log_alpha" in changed)
-    assert moved == [True, False, False, True, False, False, True]
+        moved = {name for name, tensor in agent.state_dict().items() if not torch.equal(tensor, before[name])}
+        assert "critics.q1.1.weight" in moved and "critic_loss" in metrics
+        due = step in (0, 3, 6)
+        assert others & moved == (others if due else set())
+        assert ("actor_loss" in metrics) == due
 
 
 def test_only_the_critics_see_the_end_of_a_longer_observation():
