@@ -97,8 +97,8 @@ class Source:
 def read_command_line(script, config_class, tutorial, description):
     """The config, --resume's directory or None, and --evaluate's file or None. Raises InputError.
 
-    It is read twice. The first reading finds the `Source` alone. It tells the defaults: `tutorial`, a dict, or the
-    config of a saved run or policy.
+    The command line is read twice. The first reading finds the `Source` alone. It decides the defaults of the second:
+    those of `config_class`, with the dict `tutorial` over them for --tutorial, or the config of a saved run or policy.
     """
     given, _ = tyro.cli(Source, return_unknown_args=True, add_help=False)
     if sum(bool(value) for value in vars(given).values()) > 1:
@@ -266,7 +266,7 @@ class ObservationScaling(torch.nn.Module):
         high = observations.amax(0)
         average([low, high])  # in place: the processes' mean extremes, so that all have the same scales
         spread = torch.where(high > low, (high - low) / 2, 1.0)  # half the range of the data; 1 for a constant
-        self.bounded &= self.half_range <= 130 * spread  # CartPole has at most 84, a constant uint8 127.5
+        self.bounded &= self.half_range <= 130 * spread  # the ratio: CartPole's is at most 84, a constant uint8's 127.5
         self.center[~self.bounded] = 0.0
         self.half_range[~self.bounded] = 1.0
         large = ~self.bounded & (torch.maximum(low.abs(), high.abs()) > 10)
@@ -589,7 +589,7 @@ class TableWriter:
                 self._show(table, row)
 
     def add(self, table, row):
-        """Adds a row. A CSV has the columns of its first row: later ones go to TensorBoard alone."""
+        """Adds a row. A CSV has the columns of its first row: later columns go to TensorBoard alone."""
         rows = self.tables[table]
         rows.append(row)
         self._show(table, row)
@@ -803,7 +803,7 @@ class Run:
 
     def finish(self, step, observation_shape):
         """Saves and evaluates once more, draws the curve, exports and films the policies, says where all lies."""
-        self.save(step)  # before the evaluation: a run that --resume makes longer has none here
+        self.save(step)  # before the evaluation, which a run that was longer from the start would not have here
         self.evaluate(step, self.agent.policy)
         self.stop_if_requested(step)
         if self.rank:

@@ -407,8 +407,8 @@ def soft_update(target, source, tau):
 def cuda_graph(agent, function):
     """For --cuda-graph: wraps `function(batch)`. Its third call is recorded, and later calls replay the record.
 
-    Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same. A recorded
-    update repeats the same operations: leave --cuda-graph out when your update has an `if` on data.
+    Without a graph, the GPU waits for Python between hundreds of small operations. The results are the same: a replay
+    repeats the operations, with new random numbers. Leave --cuda-graph out when your update has an `if` on data.
     Raises InputError where there is no GPU, or more than one process.
     """
     if agent.device.type != "cuda" or torch.distributed.is_initialized():
