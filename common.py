@@ -32,7 +32,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 import tyro
-from pydantic import ConfigDict, Field, PositiveInt
+from pydantic import ConfigDict, Field
 from tqdm import tqdm
 
 FILE_FORMAT = 5  # of checkpoints and policies
@@ -44,7 +44,9 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Below1 = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Task = Annotated[str, Field(pattern=r"^(\w[\w.]*:)?[^:]+$")]  # CartPole-v1, or my_module:MyTask-v0
-Layers = tuple[PositiveInt, ...]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|mps|cuda(:[1-9]?\d)?)$")]
+Count = Annotated[int, Field(ge=1, le=1024)]  # of environments, of threads
+Layers = tuple[Annotated[int, Field(ge=1, le=10_000)], ...]
 
 
 class InputError(Exception):
@@ -640,7 +642,8 @@ class Run:
         self.stack = contextlib.ExitStack()  # what to end and to undo at the end, the last first
 
     def __enter__(self):
-        self.stop_request = self.stack.enter_context(stop_signals())
+        self.signals = self.stack.enter_context(contextlib.ExitStack())
+        self.stop_request = self.signals.enter_context(stop_signals())
         if self.rank == 0:
             size = min(os.cpu_count(), self.config.num_eval_episodes)
             self.pool = self.stack.enter_context(worker_pool(size, start_method(self.config.env_id)))
@@ -808,8 +811,7 @@ class Run:
         self.stop_if_requested(step)
         if self.rank:
             return
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # all is saved: both signals now stop at once
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        self.signals.close()  # all is saved: from here on Ctrl-C and SIGTERM do what they did before the run
         self.progress.close()
         self._plot()
         if self.config.video:

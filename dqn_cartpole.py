@@ -65,8 +65,8 @@ class Config:
     layers: common.Layers = (100, 50)  # hidden units of the Q-network
 
     seed: common.Seed = 0  # source of the run's randomness
-    device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: PositiveInt = 1  # CPU threads of the update; more gain nothing here
+    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: common.Count = 1  # CPU threads of the update; more gain nothing here
     run_dir: Path | None = None  # a new directory for the results (default: runs/dqn_cartpole-<time>-seed<seed>)
     video: bool = True  # film the trained agent, a random one, and the progress between
     log_interval: PositiveInt = 200  # updates between rows of train.csv
@@ -216,7 +216,7 @@ class DQNAgent(nn.Module):
 
         Q = (mean r + mean |r| × output) / (1 − γ), so the network learns numbers of size 1, not 100. Output 0 stands
         for an episode that never ends and earns the mean reward. CartPole's rewards are 1: with γ = 0.99, Q = 100 +
-        100 × output, and output −1 stands for no more reward. If all rewards were 0, Q stays the output.
+        100 × output, and output −1 stands for no more reward. If γ is 1, or all rewards were 0, Q is the output.
         """
         if self.config.observation_scaling:
             self.scaling.fit(observations)

@@ -19,8 +19,7 @@ exploits its errors. In SAC's paper slow copies of the critics, the target criti
 it themselves, as in CrossQ, a later variant of SAC (arXiv:1902.05605): batch normalization makes this stable enough.
 
 This script reimplements the TF-Agents tutorials "SAC minitaur" (2018, 2021, 2023), after Haarnoja et al. 2018, "Soft
-Actor-Critic Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours"; README says
-why.
+Actor-Critic Algorithms and Applications" (https://arxiv.org/abs/1812.05905). `Config` marks what is "ours", README why.
 """
 
 import copy
@@ -51,7 +50,7 @@ class Config:
     num_iterations: PositiveInt = 60_000  # ours (theirs: 100 000): gradient updates
     initial_collect_steps: PositiveInt = 10_000  # random steps before the first update, of all environments together
     collect_steps_per_iteration: PositiveInt = 1  # steps of each environment for each update
-    num_envs: PositiveInt = 4  # ours (theirs: 1): environments at once, each in a worker process
+    num_envs: common.Count = 4  # ours (theirs: 1): environments at once, each in a worker process
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
     actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): actor and α move in every third update
@@ -77,8 +76,8 @@ class Config:
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
 
     seed: common.Seed = 0  # source of the run's randomness
-    device: str = "auto"  # auto, cpu, cuda, cuda:N or mps
-    num_threads: PositiveInt = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
+    device: common.Device = "auto"  # auto, cpu, cuda, cuda:N or mps
+    num_threads: common.Count = 1  # CPU threads of the update: 1 or 2 on two cores, 4 on sixteen
     cuda_graph: bool = False  # on a GPU: record the update once and repeat it, about twice as fast: see `cuda_graph`
     run_dir: Path | None = None  # a new directory for the results (default: runs/sac_minitaur-<time>-seed<seed>)
     video: bool = True  # film the trained agent, a random one, and the progress between
@@ -315,7 +314,7 @@ class SACAgent(nn.Module):
             self.reward_scale.copy_(self.config.reward_scale_factor / divisor)
 
     def scaled(self, observations):
-        """Observations (…, S) with the task's O numbers scaled. The critics' batch norm scales the privileged ones."""
+        """Observations (…, S) with the task's O numbers scaled. The critics' batch norm, if any, scales the others."""
         size = self.actor.observation_size
         return torch.cat((self.scaling(observations[..., :size]), observations[..., size:]), dim=-1)
 

@@ -3,7 +3,10 @@
 import os
 import signal
 import socket
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 from unittest import mock
 
 import gymnasium as gym
@@ -13,7 +16,7 @@ import torch
 import common
 import sac_minitaur
 from runs import ROOT, Process, assert_same, assert_same_run, before_call, checkpoint, die, flags
-from runs import rows, run_python, wait_until
+from runs import rows, session, wait_until
 
 SCRIPT = "sac_minitaur"
 
@@ -132,7 +135,14 @@ def test_a_batch_that_two_processes_cannot_share():
         common.Run(SCRIPT, config, sac_minitaur.evaluate, rank=0, world_size=2)
 
 
-def test_torchrun_trains_one_agent(tmp_path):
-    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    run_python(tmp_path, *torchrun, ROOT / "sac_minitaur.py", *flags(SCRIPT, tmp_path / "run", "--num-iterations", 50))
+def test_torchrun_ends_when_a_rank_is_killed(tmp_path):
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*torchrun, ROOT / "sac_minitaur.py", *flags(SCRIPT, tmp_path / "run", "--num-iterations", 10**6)]
+    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_until((tmp_path / "run" / "train.csv").exists)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    ranks = [int(pid) for pid in children if b"\0RANK=" in Path(f"/proc/{pid}/environ").read_bytes()]
+    os.kill(ranks[1], signal.SIGKILL)
+    assert process.wait(600) != 0
+    wait_until(lambda: not any(map(session, ranks)), seconds=60)  # one session per rank
     assert len(checkpoint(tmp_path / "run")["processes"]) == 2

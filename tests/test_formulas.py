@@ -306,6 +306,9 @@ def test_policy_acts_with_the_mean_in_the_tasks_units():
     expected = torch.tensor([[5.0, -1.0], [0.0, 5.5]]) + torch.tensor([[5.0, 2.0], [1.0, 0.5]]) * squashed
     torch.testing.assert_close(actions, expected)
     np.testing.assert_allclose(policy.act(observations[0].numpy()), expected[0].detach(), rtol=1e-5, atol=1e-6)
+    with torch.no_grad():
+        policy.actor.net[-1].bias[:4] = 100
+    assert torch.equal(policy(observations)[0].detach(), torch.as_tensor(action_space.high))
 
 
 @pytest.mark.parametrize("batch_norm", (True, False))

@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -72,7 +73,7 @@ def test_tutorial_sets_every_value_that_is_ours_to_theirs(script):
 
 OUT_OF_RANGE = {
     "sac_minitaur": """
-        --batch-size 0, --num-envs 0, --critic-layers 0, --device tpu, --env-id a:b:c, --actor-learning-rate -1,
+        --batch-size 0, --num-envs 1025, --critic-layers 0, --device tpu, --env-id a:b:c, --actor-learning-rate -1,
         --adam-beta1 1, --gamma 1.01, --initial-log-alpha nan, --seed -1, --batch-size x, --wings 2""",
     "dqn_cartpole": "--learning-rate-decay 0, --num-envs 2, --resume x --evaluate y, --tutorial --resume x",
 }
@@ -163,6 +164,8 @@ DAMAGES = {
     "another format": partial(change, format=0),
     "another kind": partial(change, kind="video"),
     "another version's": lambda path: change(path, config=torch.load(path)["config"] | {"wings": 2}),
+    "a value out of range": lambda path: change(path, config=torch.load(path)["config"] | {"gamma": 2.0}),
+    "missing": Path.unlink,
     "a hostile value": lambda path: torch.save({"format": CreatesFile()}, path),
     "a hostile pickle": lambda path: path.write_bytes(pickle.dumps(CreatesFile())),
 }

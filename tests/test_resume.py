@@ -173,6 +173,17 @@ def test_what_may_change(script, reference):
     assert config == dataclasses.replace(saved, **changes) and config.batch_size == 24
 
 
+def test_a_csv_keeps_its_columns(tmp_path):
+    """A metric that appears later goes to TensorBoard alone."""
+    writer = common.TableWriter(tmp_path, {"train": []})
+    shown = []
+    writer.board.add_scalar = lambda *scalar: shown.append(scalar)
+    writer.add("train", {"step": 20, "loss": 1.5})
+    writer.add("train", {"step": 40, "loss": math.nan, "one": 1.0})
+    assert rows(tmp_path / "train.csv") == [["step", "loss"], ["20", "1.5"], ["40", "nan"]]
+    assert shown == [("train/loss", 1.5, 20), ("train/one", 1.0, 40)]
+
+
 @pytest.mark.parametrize("number, status", [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
 def test_a_signal_ends_the_run_and_all_its_processes(script, number, status, tmp_path):
     """A terminal sends Ctrl-C to all processes. The run saves a checkpoint and says how to continue."""

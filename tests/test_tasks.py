@@ -353,3 +353,10 @@ def test_the_policy_that_readme_films(monkeypatch, capsys, tmp_path):
         frames = [np.asarray(frame) for frame in video]
     assert len(frames) == 26 and frames[0].shape == (360, 480, 3)
     assert np.abs(np.subtract(*np.float32([frames[0], frames[-1]]))).max() > 100  # the robot is seen, and moves
+
+
+def test_evaluation_episodes_are_none_of_trainings():
+    evaluation = set(common.evaluation_seeds(sac_minitaur.Config(num_eval_episodes=100)))
+    training = {common.derive_seed(0, env, update) for env in range(100) for update in range(100)}
+    training |= {common.derive_seed(0, env) for env in range(100)}
+    assert len(evaluation) == 100 and len(training) == 10_100 and not evaluation & training
