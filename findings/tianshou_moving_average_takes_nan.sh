@@ -4,8 +4,7 @@
 # Who meets it: somebody whose loss is NaN once, and who looks at the smoothed losses of Tianshou's
 # trainer. It keeps one MovAvg for each loss.
 #
-# The guess: NaN is left out, as infinity is. "Automatically exclude the infinity and NaN" is the
-# promise of the class.
+# The guess: NaN is left out, as infinity is. The docstring of the class promises both.
 #
 # The behaviour: a value is left out when it is in a list that has np.nan. NaN equals nothing, so
 # Python finds it there only if it is that very object. A tensor, an array, a numpy number and
