@@ -12,7 +12,8 @@
 # episode. So the last reward of an episode reaches no earlier step, and the last step itself
 # takes over what the next episode's first step earns. The same function without GAE is right.
 #
-# Seen on 2026-11-29 with Python 3.11.7, agilerl 2.58.0, torch 2.13.0, gymnasium 1.0.0, numpy 2.4.6:
+# Seen on 2026-11-29 with Python 3.11.7, agilerl 2.58.0 (it needs peft, but does not say so), torch
+# 2.13.0, gymnasium 1.0.0, numpy 2.4.6:
 #   collect_rollouts stored rewards 0 0 1 and dones 0 0 1
 #   two episodes of three steps, rewards 0 0 1 and 7 0 10:
 #   use_gae=True:   0 0 8 7 0 10
