@@ -9,12 +9,12 @@
 The Q-network estimates Q(s, a): the sum of the rewards after action a in state s, with the best actions from then on.
 A reward one step later counts γ times as much. Each update moves Q(s, a) towards a target:
 
-    y = r + γ max Q̄(s', ·), or y = r where the pole fell
+    y = r + γ max Q̄(s', ·), or y = r where the task ended: the pole fell
 
 Here r is the reward, s' is the next state, and the maximum is over all actions there. Q̄ is the target network, a slow
 copy of the Q-network. Without it each update would move its own target, too, and Q could diverge. The greedy policy
 takes the action of the largest Q. While it collects data, some actions are random: so it explores. A replay buffer
-keeps the transitions (s, a, r, s', fell). Each update learns from a few, drawn at random: neighbours are too similar.
+keeps the transitions (s, a, r, s', terminated). Each update learns from a few at random: neighbours are too similar.
 
 This script reimplements the TF-Agents tutorial "Train a Deep Q Network" (editions of 2021 and 2023), after Mnih et al.
 2015, "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236). `Config` marks

@@ -53,13 +53,13 @@ class Config:
     num_envs: common.Count = 4  # ours (theirs: 1): environments at once, each in a worker process
     replay_buffer_capacity: PositiveInt = 1_000_000  # ours (theirs: 1e4; 2018: 1e6): transitions kept by each process
     batch_size: PositiveInt = 128  # ours (theirs: 256): transitions for each update, over all processes
-    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): actor and α move in every third update
+    actor_update_interval: PositiveInt = 3  # ours, as in CrossQ (theirs: 1): updates for each move of actor and α
 
     actor_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the actor
     critic_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for the critics
     alpha_learning_rate: NonNegativeFloat = 1e-3  # ours, as in CrossQ (theirs: 3e-4): Adam's, for log α
     adam_epsilon: NonNegativeFloat = 1e-7  # Adam's ε, Keras's value
-    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1, as in CrossQ, but here α's, too
+    adam_beta1: common.Below1 = 0.5  # ours (theirs: 0.9): Adam's β1. CrossQ lowers the networks'. Here α has it, too
     privileged_critics: bool = True  # ours (theirs: no): critics see speed, turning and height (arXiv:1710.06542)
     critic_batch_norm: bool = True  # ours (theirs: no): batch norm instead of target critics (CrossQ, arXiv:1902.05605)
     target_update_tau: common.Fraction = 0.005  # without batch norm: target ← target + τ (critics − target) per update
@@ -68,9 +68,9 @@ class Config:
     observation_scaling: bool = True  # ours (theirs: no): bring observations near [-1, 1]: `common.ObservationScaling`
     reward_scaling: bool = True  # ours (theirs: no): divide rewards by their std under random actions
     reward_scale_factor: NonNegativeFloat = 0.5  # ours (theirs: 1): factor of the rewards, after the division
-    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): the policy averages actors: see `SACAgent`
+    averaged_actor_tau: common.Fraction = 0.015  # ours (theirs: 1): policy ← policy + τ (actor − policy)
     critic_loss_weight: NonNegativeFloat = 0.5  # factor of each critic's loss (TF-Agents' default)
-    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): per number of an action; uniform actions have ln 2
+    target_entropy_per_action: float = -1.0  # ours (theirs: −0.5): entropy that α aims at, per number of an action
     initial_log_alpha: float = 0.0  # log α at the start (TF-Agents' default); α weighs the entropy against Q
     actor_layers: common.Layers = (256, 256)  # hidden units of the actor
     critic_layers: common.Layers = (256, 256)  # hidden units of each critic
@@ -108,8 +108,8 @@ TUTORIAL = {
 }
 
 
-# In shapes: B batch, K environments, N transitions stored, O observation, S = O + the privileged numbers, A action.
-# The agent and the buffer call all S numbers an observation, the critics call them a state. The actor uses the first O.
+# In shapes: B batch, K environments, N transitions stored, A action, O the task's observation. In training it has S
+# numbers: these O, then the privileged ones. The actor uses the first O. The critics use all S and call them a state.
 
 
 def mlp(inputs, hidden_layers, outputs, batch_norm=False):
