@@ -110,4 +110,4 @@ assert rewards == dones == [0, 0, 1], "changed: other flags are stored"
 assert without == RIGHT
 assert with_gae == [0, 0, 8, 7, 0, 10], "changed: GAE uses the flag of the step itself now"
 PY
-"$work/venv/bin/python" -W ignore "$work/show.py" 2>&1
+"$work/venv/bin/python" -W ignore "$work/show.py"

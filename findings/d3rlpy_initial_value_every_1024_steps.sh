@@ -7,9 +7,9 @@
 # The guess: the mean of Q at the first state of each episode, one number an episode. So says the
 # formula in its documentation.
 #
-# The behaviour: each episode is cut into windows of 1 024 steps to bound the memory. The first
-# state of each window counts as an initial one. So a long episode counts several times, with
-# states from its middle, whose values may be quite different. Up to 1 024 steps it is right.
+# The behaviour: each episode is cut into windows of 1 024 steps. The first state of each window counts
+# as an initial one. So a long episode counts several times, with states from its middle, whose
+# values may be quite different. Up to 1 024 steps it is right.
 #
 # Seen on 2026-11-29 with Python 3.11.7, d3rlpy 2.8.1, torch 2.13.0, numpy 2.4.6, gymnasium 1.0.0.
 # The observation is the number of the step. Asked are, for one episode:

@@ -2,7 +2,7 @@
 # navix: its PPO discounts step t of an episode by gamma ** t, not by gamma.
 #
 # Who meets it: everybody who trains the agent that comes with it, navix.agents.PPO, on a task
-# whose reward comes at the end of the episode. In navix nearly all are such tasks.
+# whose reward comes at the end of the episode, such as to reach a goal.
 #
 # The guess: env.gamma is the discount of one step. With gamma = 0.99, lambda = 1, values of 0 and
 # a reward of 1 in the last of 100 steps, the target k steps before the end is 0.99 ** k.

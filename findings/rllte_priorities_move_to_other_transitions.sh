@@ -10,8 +10,8 @@
 # The behaviour: the transitions lie in a deque, which moves them all by one when it is full. The
 # priorities lie in an array that does not move, and the new one is written where a ring would have
 # it. So after one more transition the priority of transition 5 is that of 6, and the new
-# transition has the old priority of the last one. From then on what is drawn has nothing to do
-# with the errors that were reported.
+# transition has the old priority of the last one. An error that is reported fits its transition
+# until the next one comes, and then moves on again.
 #
 # Seen on 2026-11-29 with Python 3.11.7, rllte-core 1.0.1, torch 2.5.1, gymnasium 0.29.1, numpy 1.26.4.
 # Eight places, transitions 0 to 7; the priority of 5 is set to 1, of the others to 0.000001:

@@ -9,8 +9,8 @@
 #
 # The behaviour: only the weight at the start is multiplied by the environment's step_dt, 0.02 s for
 # a controller of 50 Hz. The value at the end is used as it is given. So the bonus is largest at
-# the end of the training, where it should be gone. Only an end of exactly 0 hides it. Multiply
-# final_value by step_dt yourself.
+# the end of the training, where it should be smallest. An end below weight * step_dt, such as 0,
+# hides it. Multiply final_value by step_dt yourself.
 #
 # Seen on 2026-11-30 with Python 3.11.7, rsl-rl-lib 5.5.1, torch 2.13.0, tensordict 0.15.3. The weight
 # after every 50 of 250 steps, for a schedule over 200 steps from 1 to 0.1:
